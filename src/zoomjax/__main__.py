@@ -7,7 +7,9 @@ Processes that detect lines import this module anew, as Python does on all syste
 def main() -> None:
     """Run the command line."""
     from .app.ending import ending_at_once
+    from .app.streams import open_streams
 
+    open_streams()
     with ending_at_once():
         from .app.cli import main as run
 

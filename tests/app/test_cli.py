@@ -699,6 +699,28 @@ def test_a_url_is_no_name_of_a_file_here(tmp_path):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.png", "lens.json"]
 
 
+def test_a_home_folder_that_the_shell_did_not_fill_in_is_no_folder_here(tmp_path):
+    """Results went to the folder ~ here, and were said to be in ~/out."""
+    scenes.nikkor_18_200((60, 40)).save(tmp_path / "lens.json")
+    cv2.imwrite(str(tmp_path / "a.png"), np.zeros((40, 60), np.uint8))
+    commands = [
+        ["undistort", "lens.json", "a.png", "--focal", 30, "--output=~/out"],
+        ["undistort", "lens.json", "~/*.png", "--focal", 30, "-o", "b"],
+        ["undistort", "lens.json", "a.png", "--focal=~/f.csv", "-o", "b"],
+        ["calibrate", "a.png", "--focal", 30, "--output=~"],
+        ["export", "~/lens.json", "--to", "lensfun", "-o", "b.xml"],
+    ]
+    names = ["--output is '~/out'", "An argument is", "--focal is", "--output is '~'", "An argument is"]
+    for name, (status, told) in zip(names, one_after_another(tmp_path, commands), strict=True):
+        assert status == 2
+        assert name in told
+        assert "write the folder in full, or ./~ for one of this name" in " ".join(told.split())
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.png", "lens.json"]
+    done = zoomjax("undistort", "lens.json", "a.png", "--focal", 30, "-o", "./~/b.png", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "~" / "b.png").exists()
+
+
 def test_a_mistake_is_told_on_stderr(wrong_files):
     arguments, hint = next(iter(WRONG.values()))
     done = zoomjax("calibrate", *arguments, "-o", "out", cwd=wrong_files)

@@ -2,8 +2,10 @@
 
 import csv
 import json
+import shlex
 import subprocess
 import warnings
+from pathlib import Path
 
 import av
 import cv2
@@ -15,7 +17,7 @@ import pytest
 import zoomjax as zj
 from zoomjax import scenes
 from zoomjax.app.arguments import results_of
-from zoomjax.app.clips import ClipJob, wants_motion
+from zoomjax.app.clips import ClipJob, correction_command, wants_motion
 from zoomjax.app.heard import heard
 from zoomjax.app.known_focals import known_focals
 from zoomjax.app.model_choice import WantedModel
@@ -648,6 +650,13 @@ def test_things_that_move_and_pass_for_noise_are_told(tmp_path, seed):
     assert done.following() > 0.6
     assert any("may be on things that move" in str(finding) for finding in done.findings)
     assert done.verdict != "good"
+
+
+def test_the_command_that_corrects_a_clip_can_be_pasted():
+    lens, clip, track = Path("my lens/lens.json"), "it's a clip.mp4", Path("my lens/track.csv")
+    told = shlex.split(correction_command(lens, clip, track=track))
+    assert told[:4] == ["zoomjax", "undistort", str(lens), clip]
+    assert told[4:] == ["--focal", str(track), "-o", "corrected.mp4"]
 
 
 def test_results_of_a_clip_without_lines_are_refused_as_such(tmp_path):

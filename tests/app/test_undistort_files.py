@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -94,6 +95,32 @@ def test_a_dry_run_says_what_would_be_written(folder):
     assert done.returncode == 0, done.stderr
     assert "  zoom.mp4 -> planned.mp4" in done.stdout
     assert not [*folder.glob("planned*")]
+
+
+@pytest.mark.filterwarnings("ignore:The lens is for images of")
+@pytest.mark.parametrize("redistort", [False, True])
+@pytest.mark.parametrize("keep", ["same", "grow"])
+def test_a_dry_run_says_of_photos_what_the_run_says(folder, tmp_path, keep, redistort):
+    """Of one that is done already, and of one that is turned, the run and its rehearsal say the same."""
+    job = Job(folder / "lens.json", (folder / "a.jpg",), tmp_path / "in", focal="30", keep=keep)
+    undistort_files(job)
+    [done] = (tmp_path / "in").iterdir()
+    done = done.rename(done.with_name("done.jpg"))
+    stored = cv2.imread(str(done), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    cv2.imwrite(str(tmp_path / "in/turned.jpg"), np.ascontiguousarray(np.rot90(stored)))
+    shutil.copy(folder / "b.jpg", tmp_path / "in")
+    if redistort:
+        undistort_files(
+            dataclasses.replace(job, inputs=(done,), output=tmp_path / "in/e.jpg", redistort=True)
+        )
+    job = dataclasses.replace(
+        job, inputs=(tmp_path / "in",), output=tmp_path / "out", redistort=redistort, resume=True
+    )
+    planned = undistort_files(dataclasses.replace(job, dry_run=True))
+    made = undistort_files(job)
+    assert planned.skipped == made.skipped
+    assert planned.files == made.files
+    assert len(made.skipped) == (3 if redistort and keep == "grow" else 2)
 
 
 def test_results_of_an_earlier_run_in_place_of_those_of_skipped_files_are_said(folder, tmp_path):

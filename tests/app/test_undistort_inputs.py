@@ -335,6 +335,16 @@ def test_videos_of_one_name_do_not_share_a_track(folder):
         undistort_files(job(folder, "clips/one", focal=str(folder / "tracks"), out="other"))
 
 
+def test_a_folder_without_the_track_of_a_video_is_named(folder):
+    (folder / "tracks").mkdir()
+    (folder / "tracks/track.csv").write_text("frame,focal\n0,20\n")
+    write_clip(folder / "c.mp4", 2, sound=False)
+    with pytest.raises(
+        FileNotFoundError, match=r"folder .*tracks has no c\.csv, the track of .*c\.mp4: name"
+    ):
+        undistort_files(job(folder, "c.mp4", focal=str(folder / "tracks")))
+
+
 def test_again_is_for_photos(folder):
     write_clip(folder / "a.mp4", 2, sound=False)
     with pytest.raises(ValueError, match=r"Argument again is for photos, .*: leave it out"):

@@ -1,13 +1,34 @@
 """What all commands share: help without the types of flags and arguments, and no empty names of files."""
 
+import os
 from typing import Any
 
 from typer.core import TyperCommand
 
 from .._core.copies import is_url, shown_url
 
-_NO_FILES = ("inputs", "cluster", "search", "name")
-"""Parameters that take URLs, or words that are not of files."""
+_WORDS = ("cluster", "search", "name")
+"""Parameters that take words which are not of files."""
+
+_NO_FILES = ("inputs", *_WORDS)
+"""Those that take URLs, too."""
+
+
+def _refuse_url(name: str, word: str, *, when: bool) -> None:
+    if when and is_url(word):
+        raise ValueError(
+            f"{name} is {shown_url(word)!r}, but files are meant here, not URLs: "
+            + ("copy the results there afterwards." if name == "--output" else "copy it first.")
+        )
+
+
+def _refuse_home(name: str, word: str, *, when: bool) -> None:
+    at_home = word == "~" or word.startswith("~/")
+    if when and at_home and (name == "--output" or not os.path.exists("~")):
+        raise ValueError(
+            f"{name} is {word!r}, where the shell has left ~ as it is, and not as your home folder, as in "
+            "quotes and after =: write the folder in full, or ./~ for one of this name."
+        )
 
 
 class PlainCommand(TyperCommand):
@@ -21,8 +42,8 @@ class PlainCommand(TyperCommand):
         """Parse the words after the command.
 
         Raises:
-            ValueError: an argument, or the output, is empty; or there is a URL where a file is meant, which
-                would be one of that name here.
+            ValueError: an argument, or the output, is empty; or there is a URL where a file is meant, or a
+                home folder that the shell did not fill in, which would be one of that name here.
         """
         given: dict[str, Any] = {}
         if not ctx.resilient_parsing:  # which completes words
@@ -31,20 +52,16 @@ class PlainCommand(TyperCommand):
             of: Any = parameter
             path = of.name == "output" or (of.param_type_name == "argument" and of.name != "search")
             value = given.get(of.name)
-            values = value if isinstance(value, list | tuple) else [value]
-            name = "--output" if of.name == "output" else "An argument"
-            for url in values if of.name not in _NO_FILES else ():
-                if isinstance(url, str) and is_url(url):
-                    name = max(of.opts, key=len) if of.param_type_name == "option" else name
-                    raise ValueError(
-                        f"{name} is {shown_url(url)!r}, but files are meant here, not URLs: "
-                        + (
-                            "copy the results there afterwards."
-                            if of.name == "output"
-                            else "copy it first."
-                        )
-                    )
-            if path and "" in values:
+            words = [
+                word
+                for word in (value if isinstance(value, list | tuple) else [value])
+                if isinstance(word, str)
+            ]
+            name = max(of.opts, key=len) if of.param_type_name == "option" else "An argument"
+            for word in words:
+                _refuse_url(name, word, when=of.name not in _NO_FILES)
+                _refuse_home(name, word, when=of.name not in _WORDS)
+            if path and "" in words:
                 raise ValueError(
                     f"{name} is empty, as a variable of the shell that is not set: name a file or a "
                     "folder, or . for this one."

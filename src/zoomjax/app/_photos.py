@@ -15,7 +15,7 @@ import numpy as np
 from .._core.executors import arrived, checked_executor, in_order, is_away, sent
 from .._core.files import whole_file
 from ..correct.framing import Framing, frame_output
-from ..correct.photo import Correction, corrected_photo
+from ..correct.photo import Correction, check_ahead, corrected_photo
 from ..correct.redistort import check_framed
 from ..models.lens import ZoomLens
 from ..models.sizes import at_focal, lens_for_size
@@ -138,6 +138,13 @@ def corrected_photos(
                 yield one.item.source, one.item.target, RuntimeError(_ELSEWHERE)
             else:
                 yield one.item.source, one.item.target, one.result
+
+
+def foreseen(correction: Correction, focal_of: Callable[[Path], float], source: Path) -> str:
+    """What is known of the correction of a photo before any work; it raises what is known to be refused."""
+    focal = focal_of(source)
+    check_ahead(source, correction)
+    return f", f = {focal:g} {correction.lens.focal_unit}"
 
 
 def _absolute(task: _Task) -> _Task:

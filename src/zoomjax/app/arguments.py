@@ -156,6 +156,29 @@ def results_of(path: str) -> Path | None:
     )
 
 
+def with_lines_of_results(inputs: list[str], *, meant: bool) -> list[str]:
+    """The inputs; in place of folders of results, their lines.
+
+    Args:
+        inputs: as they are given.
+        meant: whether an option says that lines are to be fitted, and not photos.
+
+    Raises:
+        ValueError: a folder holds photos, too, which the lines need not be of.
+    """
+    from ..detect.sources import files_within
+    from ..io.photo import SUFFIXES
+
+    found = {path: lines for path in inputs if (lines := results_of(path))}
+    for path, lines in () if meant else found.items():
+        if photos := files_within(Path(path), SUFFIXES):
+            raise ValueError(
+                f"{path} holds photos, such as {photos[0]}, and the results of a calibration: give {lines} "
+                f"to fit its lines again, or the photos, as by {photos[0].with_stem('*')}."
+            )
+    return [str(found.get(path, path)) for path in inputs]
+
+
 _OF_A_CLIP = {
     *("lens.json", "summary.json", "report.html", "tracks.npz", "track.csv", "motion.png", "panorama.jpg"),
     ".zoomjax.json",

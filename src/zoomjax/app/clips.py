@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import shlex
 import sys
 import warnings
 from collections.abc import Sequence
@@ -252,7 +253,10 @@ def _show(done: "MotionCalibration", job: ClipJob, show: Shown) -> None:
     ]
     print(f"\nWritten to {plain(str(job.output))}: {', '.join(files)}")
     lens, track = job.output / "lens.json", job.output / "track.csv"
-    print(
-        f"Correct the clip with zoomjax undistort {plain(str(lens))} {plain(job.inputs[0])} "
-        f"--focal {plain(str(track))} -o corrected.mp4"
-    )
+    print(f"Correct the clip with {correction_command(lens, job.inputs[0], track=track)}")
+
+
+def correction_command(lens: Path, clip: str, *, track: Path) -> str:
+    """The command that corrects a clip, as a shell takes it."""
+    first, second, third = (shlex.quote(plain(str(path))) for path in (lens, clip, track))
+    return f"zoomjax undistort {first} {second} --focal {third} -o corrected.mp4"

@@ -28,9 +28,9 @@ from .arguments import (
     read_lines,
     refits,
     refuse_to_replace,
-    results_of,
     split_lens,
     unit_of,
+    with_lines_of_results,
 )
 from .clips import ClipJob, calibrate_clip, refuse_idle_for_clips, wants_motion
 from .console import REPORT, progress_bar, show_calibration, show_images, stages
@@ -235,7 +235,7 @@ def calibrate(
     removed; its lines.npz, tracks.npz and track.csv stay until they are
     written again.
     """
-    inputs = [str(results_of(path) or path) for path in at_hand(context, inputs, quiet=quiet)]
+    inputs = with_lines_of_results(at_hand(context, inputs, quiet=quiet), meant=bool(exclude) or robust)
     of_lines = [path for path in inputs if path.lower().endswith((".npz", ".csv"))]
     if not (of_lines or dry_run or cluster):
         import_ahead(DETECTION)

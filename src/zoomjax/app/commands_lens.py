@@ -56,8 +56,9 @@ def lens(
         return
     if crop is not None:
         raise ValueError("--crop is for a lens that is written: give --output, too.")
-    from rich.console import Console
     from rich.table import Table
+
+    from .console import show_table
 
     found, more = rows(search, size)
     table = Table(box=None)
@@ -65,6 +66,6 @@ def lens(
         table.add_column(column, justify="left" if column in ("lens", "model") else "right")
     for row in found:
         table.add_row(plain(row.name), row.crop, row.focal, row.model, row.error)
-    Console().print(table, highlight=False)
+    show_table(table, highlight=False)
     if more > 0:
         print(f"and {more} more: search by more words.")

@@ -4,7 +4,7 @@ from .._core.text import plain
 from ._jax import set_up_jax
 from .arguments import Overwrite
 from .commands import app
-from .console import stages
+from .console import show_table, stages
 from .options import ResultsFolder
 
 
@@ -20,7 +20,6 @@ def reproduce(
     the paper, Figures 5 to 10 as PNG and PDF, and reproduce.json.
     """
     set_up_jax()
-    from rich.console import Console
     from rich.table import Table
 
     from . import reproduce as again
@@ -28,14 +27,13 @@ def reproduce(
 
     with results_folder(output, again.FILES, overwrite=overwrite) as folder, stages() as stage:
         experiments = again.reproduce(folder, stage)
-    console = Console()
     for title, experiment in zip(("Table 1, striped board", "Table 2, football"), experiments, strict=True):
         table = Table("", title=f"\n{title}: RMS residuals", title_justify="left", box=None)
         for column in ("the paper", "here", "difference"):
             table.add_column(column, justify="right", no_wrap=True)
         for row in experiment.rows:
             table.add_row(row.name, *row.cells())
-        console.print(table, highlight=False)
+        show_table(table, highlight=False)
     print(
         "\nAll scenes are synthetic. Tables, figures and the origin of each number are in "
         f"{plain(str(output / 'reproduce.md'))}."

@@ -189,7 +189,7 @@ def show_calibration(
             scale = [magnification(float(f)) for f in calibration.lines.focal]
             cells.append(f"{rms_over_frames(frames / scale):.4f}")
         table.add_row(*cells)
-    console.print(table)
+    show_table(table)
     console.print(" ".join(filter(None, (calibration.held_out, calibration.weighting))), highlight=False)
     console.print()
     if calibration.selection:
@@ -202,7 +202,7 @@ def show_calibration(
         terms = " ".join(f"{value:+.4e}{power}" for value, power in zip(column, powers, strict=True))
         console.print(f"{name}(f) = {terms}   px^-{order}", highlight=False)
     if not polynomials.size:
-        console.print(_coefficients(calibration))
+        show_table(_coefficients(calibration))
     console.print(f"\n{calibration.centre.sentence}", highlight=False)
     corner = [
         with_std(moved, std, "px") + f" at {f:.4g} {unit}" * calibration.focal_known
@@ -214,9 +214,18 @@ def show_calibration(
     console.print(calibration.advice(), highlight=False)
 
 
+def show_table(table: "Table", *, highlight: bool = True) -> None:
+    """Print a table for a terminal of a usual width at least: rows of a narrower one lost figures."""
+    from rich.console import Console
+
+    Console(width=max(Console().width, _USUAL)).print(table, highlight=highlight)
+
+
+_USUAL = 80
+
+
 def show_choice(selection: "Selection") -> None:
     """Print what the models that were compared leave of lines left out, the chosen one marked by ">"."""
-    from rich.console import Console
     from rich.table import Table
 
     table = Table(title=selection.title, title_justify="left", box=None, pad_edge=False)
@@ -232,11 +241,10 @@ def show_choice(selection: "Selection") -> None:
         table.add_row(
             f"{mark} {row[0]}", row[1], row[3], "best" if of.candidate is selection.best else best
         )
-    console = Console()
-    console.print(table)
+    show_table(table)
     if selection.why:
         say(selection.why)
-    console.print()
+    print()
 
 
 def show_frames(calibration: "Calibration", names: Sequence[str] = ()) -> None:
@@ -271,7 +279,7 @@ def show_frames(calibration: "Calibration", names: Sequence[str] = ()) -> None:
             str(rejected[frame]),
         )
     console.print()
-    console.print(table)
+    show_table(table)
     versions = ", ".join(f"{name} {of}" for name, of in summary["versions"].items())
     console.print(f"\nVersions: {versions}", highlight=False)
 

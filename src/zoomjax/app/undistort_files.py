@@ -19,7 +19,7 @@ from ..io.metadata import geometry_of, work_of
 from ..io.photo import read_metadata
 from ..models.about import UNKNOWN
 from ..models.lens import ZoomLens, load_lens
-from ._photos import BAD_FILE, SAME, CommonFraming, corrected_photos
+from ._photos import BAD_FILE, SAME, CommonFraming, corrected_photos, foreseen
 from .equipment import taken_at_others, taken_otherwise
 from .plans import files_plan
 from .relative import warn_of_relative
@@ -232,9 +232,8 @@ def undistort_photos(
     correction = dataclasses.replace(correction, keep=keep, shown=shown)
     todo = to_do(job, sources, targets, functools.partial(_is_result, job, correction, focal_of))
     if job.dry_run:
-        return _planned(
-            todo, len(sources) - len(todo), lambda source: f", f = {focal_of(source):g} {lens.focal_unit}"
-        )
+        about = functools.partial(foreseen, correction, focal_of)
+        return _planned(todo, len(sources) - len(todo), about)
     lost: Counter[tuple[str, str]] = Counter()
     wanted = [pair for pair in todo if pair[0] not in skipped]
     known = None if job.focal is None and executor is not None else focal_of

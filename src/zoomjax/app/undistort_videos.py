@@ -51,6 +51,11 @@ def tracks_of(focal: str | None, names: Mapping[Path, Path], *, hold: bool) -> d
     files = {video: _track_file(Path(focal), video, name) for video, name in names.items()}
     first: dict[Path, Path] = {}
     for video, file in files.items():
+        if not os.path.lexists(file):
+            raise FileNotFoundError(
+                f"The folder {focal} has no {file.name}, the track of {video}: name it so, or give "
+                "argument focal the file of one video."
+            )
         if (other := first.setdefault(file, video)) is not video:
             own = Path(focal) / names[video].with_suffix(".csv")
             raise ValueError(

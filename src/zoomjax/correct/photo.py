@@ -30,11 +30,20 @@ from ..io.metadata import (
     straightened_by,
     with_size,
 )
-from ..io.photo import FORMATS, Photo, metadata_focal, open_photo, read_focal, read_metadata, read_pages
+from ..io.photo import (
+    FORMATS,
+    Photo,
+    metadata_focal,
+    open_photo,
+    read_focal,
+    read_metadata,
+    read_pages,
+    read_size,
+)
 from ..io.photo_writer import check_written, encoded_photo
 from ..models.about import UNKNOWN
 from ..models.lens import ZoomLens
-from ..models.sizes import lens_for_size
+from ..models.sizes import check_aspect, lens_for_size
 from .framing import Framing, frame_output, framing_for_size
 from .image import undistort_image
 from .redistort import framing_of_corrected, redistort_image
@@ -297,12 +306,33 @@ def _check(photo: Photo, source: str | os.PathLike[str], suffix: str, correction
     name = os.fspath(source)
     if photo.colours:
         raise ValueError(f"{name} is in {photo.colours}, which are not kept: convert it to RGB first.")
-    if not correction.again and geometry_of(photo.pages[0][1]) == correction.geometry:
-        raise ValueError(
-            f"{name} is {correction.geometry} by zoomjax already. Give the original, or argument again."
-        )
+    _refuse_done(source, photo.pages[0][1], correction)
     with _blamed(source):
         check_written(photo.pages, suffix)
+
+
+def _refuse_done(source: str | os.PathLike[str], metadata: Metadata, correction: Correction) -> None:
+    if not correction.again and geometry_of(metadata) == correction.geometry:
+        raise ValueError(
+            f"{os.fspath(source)} is {correction.geometry} by zoomjax already. Give the original, or "
+            "argument again."
+        )
+
+
+def check_ahead(source: str | os.PathLike[str], correction: Correction) -> None:
+    """Refuse a photo that a correction refuses by what its header says. No pixel is decoded.
+
+    Raises:
+        FileNotFoundError: there is no such photo.
+        ValueError: its header cannot be read; or it is corrected already, or has another aspect ratio than
+            the lens.
+    """
+    _refuse_done(source, read_metadata(source), correction)
+    size = read_size(source)
+    if correction.back and correction.shown.startswith("grow"):
+        correction.keep(size)  # of another shape than the lens's images, and looked at there
+    else:
+        check_aspect(size, correction.lens.image_size)
 
 
 @contextlib.contextmanager
