@@ -217,6 +217,16 @@ def test_the_simplest_within_one_standard_error_is_chosen(selection):
     assert selection.chosen is min(good, key=lambda v: v.parameters).candidate
 
 
+@pytest.mark.parametrize("hold_out", ["line", "focal"])
+@pytest.mark.parametrize("noise", [0.0, 1e-9])
+def test_of_exact_lines_the_true_model_is_chosen(truth, hold_out, noise):
+    """Its fits could not become better, and were said not to converge: others of 0.06 px were chosen."""
+    exact = scenes.board_lines(truth, scenes.focal_sweep(6), spacing=100.0, noise=noise)
+    found = zj.select_model(zj.compress(exact), hold_out=hold_out)
+    assert found.chosen.name == "degree 2, 2 terms"
+    assert not any(one.problem for one in found.compared)
+
+
 @pytest.mark.parametrize("rule", ["one standard error", "least"])
 def test_of_candidates_that_are_the_same_the_first_is_chosen(rule, truth):
     """Rounding chose among a straight line in 1/f and its two ends, from data set to data set."""

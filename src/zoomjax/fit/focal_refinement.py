@@ -21,6 +21,7 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float
 
+from ..lines.best_line import rounded_by
 from ..lines.buckets import bucketed_jit, of_frames
 from ..models.zoom import AbstractPriorZoom, with_parameters
 from .covariance import parameter_covariance
@@ -135,19 +136,20 @@ def refined(lines, zoom, sigma):
     sigmas = jnp.repeat(jnp.stack([fixed, sigma]), number, axis=0)
     focal, flat, steps, reached, error = jax.lax.map(run, (left_out, sigmas))
     before, after = jnp.sum(error.reshape(2, number, -1)[:, 1:], axis=1)
-    kept = _worse(before, after, counted_frames(lines) & known)
+    rounding = rounded_by(lines.scale, flat.dtype)
+    kept = _worse(before, after, counted_frames(lines) & known, rounding)
     chosen = jnp.where(kept, 0, number)
     return focal[chosen], with_parameters(zoom, unravel(flat[chosen])), steps[chosen], reached[chosen], kept
 
 
-def _worse(before, after, counted):
-    """Whether the frames' errors have grown by more than one standard error of their sum, and rounding."""
+def _worse(before, after, counted, rounding):
+    """Whether the frames' errors have grown by more than a standard error of their sum, and by rounding."""
     number, difference = jnp.sum(counted), after - before
     total = jnp.sum(difference)
-    rounding = jnp.sqrt(jnp.finfo(before.dtype).eps) * jnp.sum(before)
+    least = jnp.sqrt(jnp.finfo(before.dtype).eps) * jnp.sum(before) + number * rounding**2
     off = jnp.where(counted, difference - total / jnp.maximum(number, 1), 0)
     error = jnp.sqrt(number / jnp.maximum(number - 1, 1) * jnp.sum(off**2))
-    return total > jnp.maximum(error, rounding)
+    return total > jnp.maximum(error, least)
 
 
 def _folds(lines):

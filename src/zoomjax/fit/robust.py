@@ -29,7 +29,7 @@ from .._core.arrays import as_jax
 from .._core.programs import light_program, rare_program
 from .._core.types import AnyArray, traced
 from ..lines.base import AbstractLines, SomeLines
-from ..lines.best_line import line_residuals
+from ..lines.best_line import line_residuals, rounded_by
 from ..lines.buckets import bucketed, of_lines
 from ..models.distortion_model import AbstractDistortionModel
 from ..models.model import Model
@@ -51,7 +51,6 @@ _NARROWING = (np.inf, 24.0, 16.0, 10.0, *(_CUT,) * 4)  # c of each turn
 _NEAR = (_CUT,) * len(_NARROWING)  # the same from a start that is to be kept: one compiled program
 _CENTRES = 2  # how often weights and a centre that is fitted are found in turn, at most
 _LEAST_SPREAD = 0.02  # of m: lines of thousands of points, or without noise, are all alike
-_ROUNDING = 8  # times eps and the scale: exact lines of synthetic scenes seemed so far from straight
 
 
 class RobustFit(eqx.Module):
@@ -246,7 +245,7 @@ def _weights(lines, model, cut):
     better = (line_rms <= median) & _counted(lines)
     spread = 1.4826 * _median(median - line_rms, better)
     chance = median / jnp.sqrt(2 * jnp.maximum(lines.counts - 2, 1))
-    rounding = _ROUNDING * jnp.finfo(line_rms.dtype).eps * lines.scale
+    rounding = rounded_by(lines.scale, line_rms.dtype)
     spread = jnp.sqrt(jnp.maximum(spread, _LEAST_SPREAD * median) ** 2 + chance**2 + rounding**2)
     # 1/cut is 0 in the first turn: by an infinite cut the derivative would be 0 times infinity.
     excess = (1 / cut) * jnp.maximum(line_rms - median, 0) / jnp.where(spread > 0, spread, 1)

@@ -33,3 +33,12 @@ def line_normal(centred: Float[Array, "rows 2"]) -> Float[Array, "2"]:
 def line_residuals(centred: Float[Array, "rows 2"]) -> Float[Array, "rows"]:
     """Signed distances of points about their mean to their own best line, in their unit."""
     return centred @ line_normal(centred)
+
+
+def rounded_by(scale, dtype):
+    """How far, px, exact lines seem to be from straight, of coordinates of such a size: some eps of it."""
+    return _ROUNDING * float(jnp.finfo(dtype).eps) * scale
+
+
+_ROUNDING = 8
+"""Lines of exact scenes are off by up to 2 eps, compressed or not, in float32 and float64."""

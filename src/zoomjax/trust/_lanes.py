@@ -10,6 +10,7 @@ import numpy as np
 from ..fit.image_metric import in_corrected
 from ..fit.own_weights import counts_of
 from ..fit.problem import LEAST_STRETCH
+from ..lines.best_line import rounded_by
 
 
 class Lanes(NamedTuple):
@@ -24,6 +25,7 @@ class Lanes(NamedTuple):
 
     starts: np.ndarray  # where each frame's lines begin
     frames: int  # how many there are, with or without lines
+    rounding: float  # px: how far exact lines seem to be from straight
     moments: np.ndarray | None = (
         None  # (2 terms, 3, line): xx, xy and yy of r^(2i) z z^T, means; in the image
     )
@@ -61,7 +63,8 @@ def lanes_of(lines, fold, weight, terms):
     frame, counts, weight, fold = (a[order] for a in (frame, counts, weight, np.asarray(fold)))
     moments = _moments(whole, terms) / counts if lines.metric == "distorted" else None
     starts = np.flatnonzero(np.diff(frame, prepend=-1))
-    return Lanes(columns, gram, frame, counts, weight, fold, starts, len(lines.focal), moments)
+    rounding = rounded_by(float(small.scale), float)
+    return Lanes(columns, gram, frame, counts, weight, fold, starts, len(lines.focal), rounding, moments)
 
 
 def _moments(rows, terms):

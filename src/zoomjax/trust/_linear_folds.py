@@ -198,10 +198,12 @@ def _minimised(lanes, weight, design, parameters, lines, keep=False):
         move, decrease = _move(here, _of(directions, on), damping[on])
         moved = here.parameters + move.reshape(here.parameters.shape)
         there = state(on, moved, passed_for_gradient if keep else passed)
-        better = there.energy <= here.energy * (1 + 128 * eps)  # rounding must not reject the last step
+        # Rounding must not reject the last step, nor that of exact lines.
+        same = np.maximum(here.energy * (1 + 128 * eps), (np.sqrt(here.energy) + lanes.rounding) ** 2)
+        better = there.energy <= same
         damping[on] = np.where(better, damping[on] / 10, np.maximum(10 * damping[on], 1e-3))
         _replace(at, on[better], _of(there, better))
-        arrived = better & (decrease <= 16 * eps * there.energy)
+        arrived = better & (decrease <= np.maximum(16 * eps * there.energy, lanes.rounding**2))
         good[on[arrived]], going[on[arrived]] = True, False
         on, step = np.flatnonzero(going), step + 1
         if keep and len(on) and (step == _MOST_KEPT or not better.all()):

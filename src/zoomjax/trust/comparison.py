@@ -8,6 +8,7 @@ import numpy as np
 
 from ..fit.image_metric import in_corrected
 from ..lines.base import AbstractLines
+from ..lines.best_line import rounded_by
 from ..lines.compressed import CompressedLines
 from ..models.distortion_model import AbstractDistortionModel
 from ..models.model import Model
@@ -79,11 +80,11 @@ def compare(
             places, errors_of_candidates(own, [candidates[i] for i in places], parts), strict=True
         ):
             errors[i] = of
-    return compare_errors(candidates, errors, parts, rule)
+    return compare_errors(candidates, errors, parts, rule, rounded_by(float(lines.scale), float))
 
 
-def compare_errors(candidates, errors, parts, rule):
-    """The same of candidates whose errors, or why there are none, are known."""
+def compare_errors(candidates, errors, parts, rule, rounding=0.0):
+    """The same of candidates whose errors, or why there are none, are known; and what they round by, px."""
     counted = (parts.unit >= 0) & (parts.share > 0)
     unit, share = parts.unit[counted], parts.share[counted] / parts.share[counted].sum()
     weight = np.bincount(unit, share)
@@ -103,15 +104,15 @@ def compare_errors(candidates, errors, parts, rule):
         _figures(candidate, judged, unseen.get(i), unseen[best], weight, by_unit)
         for i, (candidate, judged) in enumerate(zip(candidates, errors, strict=True))
     ]
-    within = [v for v in compared if not v.problem and v.difference <= _allowed(v, rule)]
+    within = [v for v in compared if not v.problem and v.difference <= _allowed(v, rule, rounding)]
     chosen = min(within, key=lambda v: (round(v.parameters, 6), _in_digits(v.held_out))).candidate
     return tuple(compared), candidates[best], chosen
 
 
-def _allowed(each, rule):
+def _allowed(each, rule, rounding):
     """By how much a candidate may be above the best to be chosen."""
-    least = _ROUNDING * each.held_out
-    return max(each.difference_std, least) if rule == "one standard error" else TIE * each.held_out
+    own = each.difference_std if rule == "one standard error" else TIE * each.held_out
+    return max(own, _ROUNDING * each.held_out, rounding)
 
 
 _ROUNDING = 1e-9

@@ -117,6 +117,7 @@ def cross_validate_frames(
             lanes.fold[own],
             starts=np.zeros(1, int),
             frames=1,
+            rounding=lanes.rounding,
             moments=None if lanes.moments is None else lanes.moments[..., own],
         )
         unseen[own] = cross_validated(alone, [[one] * (parts.number + 1)])[0].unseen
