@@ -24,6 +24,7 @@ from zoomjax.trust.cross_validation import (
 )
 from zoomjax.trust.folds import HoldOut, LineErrors, folds_of, shares
 from zoomjax.trust.selection import default_candidates
+from zoomjax.trust.staged_selection import select_in_stages
 
 FOCALS = 7
 POLYNOMIALS = [
@@ -223,8 +224,11 @@ def test_of_exact_lines_the_true_model_is_chosen(truth, hold_out, noise):
     """Its fits could not become better, and were said not to converge: others of 0.06 px were chosen."""
     exact = scenes.board_lines(truth, scenes.focal_sweep(6), spacing=100.0, noise=noise)
     found = zj.select_model(zj.compress(exact), hold_out=hold_out)
-    assert found.chosen.name == "degree 2, 2 terms"
-    assert not any(one.problem for one in found.compared)
+    degrees = [zj.PolynomialZoom(degree) for degree in range(4)]
+    staged = select_in_stages(zj.compress(exact, 3), degrees, (2, 1, 3))
+    for one in (found, staged):
+        assert one.chosen.name == "degree 2, 2 terms"
+        assert not any(each.problem for each in one.compared)
 
 
 @pytest.mark.parametrize("rule", ["one standard error", "least"])

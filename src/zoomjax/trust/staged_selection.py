@@ -2,8 +2,10 @@
 
 from collections.abc import Sequence
 
+from ..fit.image_metric import in_corrected
 from ..fit.zoom import fit_zoom
 from ..lines.base import AbstractLines
+from ..lines.best_line import rounded_by
 from ..models.model import Model
 from ..models.smooth import SmoothZoom
 from ..models.zoom import AbstractZoom
@@ -29,13 +31,13 @@ def select_in_stages(
     Raises:
         ValueError: no candidate can be compared.
     """
-    parts = folds_of(lines, None, folds, 0)
+    parts, rounding = folds_of(lines, None, folds, 0), rounded_by(float(in_corrected(lines).scale), float)
     candidates = [Model(zoom, terms[0]) for zoom in zooms]
     errors = errors_of_candidates(lines, candidates, parts)
-    _, best, chosen = compare_errors(candidates, errors, parts, "least")
+    _, best, chosen = compare_errors(candidates, errors, parts, "least", rounding)
     more = [Model(chosen.zoom, number) for number in terms[1:] if not isinstance(chosen.zoom, SmoothZoom)]
     errors += errors_of_candidates(lines, more, parts)
     candidates += more
-    compared, best, chosen = compare_errors(candidates, errors, parts, "least")
+    compared, best, chosen = compare_errors(candidates, errors, parts, "least", rounding)
     fit = fit_zoom(lines, zoom=chosen)
     return Selection(chosen, best, fit, compared, parts.hold_out, parts.number, "least")
