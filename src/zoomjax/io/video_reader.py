@@ -260,7 +260,8 @@ def numbered(
             usual = step
         elif -step > _HOLE * usual and not back:
             back = True
-            _warn_of_jump(number, before * item.time_base - first, item.time - first)
+            time = (item.time or 0.0) - first
+            _warn_of_jump(number, time - float(step * (item.time_base or 1)), time)
         before = item.pts
         yield item, number, math.nan if item.time is None else item.time - first
         number += 1
@@ -268,7 +269,7 @@ def numbered(
 
 def _warn_of_jump(number: int, before: float, time: float) -> None:
     warnings.warn(
-        f"Times of the video jump back from {float(before):.3f} s to {time:.3f} s, at frame {number}, as "
+        f"Times of the video jump back from {before:.3f} s to {time:.3f} s, at frame {number}, as "
         "where recordings were joined: a focal track by time is wrong from there on, and a corrected video "
         f"shows the frames after it too early. Give it new times first: {NEW_TIMES}",
         stacklevel=3,

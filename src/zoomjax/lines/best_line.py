@@ -3,7 +3,8 @@
 import math
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+import numpy as np
+from jaxtyping import Array, DTypeLike, Float
 
 from .._core.products import exact_products
 
@@ -35,9 +36,9 @@ def line_residuals(centred: Float[Array, "rows 2"]) -> Float[Array, "rows"]:
     return centred @ line_normal(centred)
 
 
-def rounded_by(scale, dtype):
+def rounded_by(scale: float, dtype: DTypeLike) -> float:
     """How far, px, exact lines seem to be from straight, of coordinates of such a size: some eps of it."""
-    return _ROUNDING * float(jnp.finfo(dtype).eps) * scale
+    return _ROUNDING * float(np.finfo(dtype).eps) * scale
 
 
 _ROUNDING = 8

@@ -233,11 +233,11 @@ class ZoomLens(eqx.Module):
 
         Where it does not move along the zoom it is `centre`, one for all. Warns and raises as a call does.
         """
-        focal = as_focal(focal)
+        given = as_focal(focal)
         if self.shift is not None:
             check_one_lens(self.centre)
-            self.check_range(focal)
-        return self._centre_at(focal)
+            self.check_range(given)
+        return self._centre_at(given)
 
     def _centre_at(self, focal):
         """The same, whatever the focal lengths."""

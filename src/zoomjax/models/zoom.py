@@ -130,7 +130,7 @@ def one_focal(focal: ScalarLike) -> ScalarLike:
 
 def one_focus(focus: ScalarLike | None) -> ScalarLike | None:
     """A focus as it is, if it is one number, or None: of several a model would add up the coefficients."""
-    if isinstance(focus, list | tuple) or np.ndim(focus) != 0:
+    if focus is not None and (isinstance(focus, list | tuple) or np.ndim(focus) != 0):
         raise ValueError(
             "Argument focus must be one number here, but its shape is "
             f"{np.shape(focus)}: lens(focal, focus) takes several, and so does jax.vmap."
