@@ -123,6 +123,13 @@ def test_a_dry_run_says_of_photos_what_the_run_says(folder, tmp_path, keep, redi
     assert len(made.skipped) == (3 if redistort and keep == "grow" else 2)
 
 
+def test_a_dry_run_tells_a_name_in_one_line(folder, tmp_path):
+    shutil.copy(folder / "b.jpg", tmp_path / "two\nlines.jpg")
+    job = Job(folder / "lens.json", (tmp_path,), tmp_path / "out", focal="30", dry_run=True)
+    [_, told] = undistort_files(job).sentence.splitlines()
+    assert told.endswith(r"out/two\nlines.jpg, f = 30 mm")
+
+
 def test_results_of_an_earlier_run_in_place_of_those_of_skipped_files_are_said(folder, tmp_path):
     photos = tuple(folder / name for name in ("a.jpg", "b.jpg"))
     job = Job(folder / "lens.json", photos, tmp_path / "out", focal="30")

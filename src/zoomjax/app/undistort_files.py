@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from .._core.files import refuse_existing, refuse_inputs, refuse_links
-from .._core.text import reason
+from .._core.text import plain, reason
 from ..correct.framing import Framing, check_keep
 from ..correct.photo import Correction, corrected_before, photo_focal
 from ..correct.sampler import check_sampling
@@ -197,7 +197,7 @@ def _planned(todo: Sequence[tuple[Path, Path]], earlier: int, about: Callable[[P
     told, skipped = [], {}
     for source, target in todo:
         try:
-            told.append(f"  {source} -> {target}{about(source)}")
+            told.append(plain(f"  {source} -> {target}{about(source)}"))
         except BAD_FILE as error:
             skipped[source] = error
     files = tuple((source, target) for source, target in todo if source not in skipped)
