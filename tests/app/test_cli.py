@@ -32,6 +32,7 @@ from zoomjax.models import BrownConrady, Model, PolynomialZoom, SmoothZoom, Spli
 from zoomjax.trust.comparison import ComparedModel
 from zoomjax.trust.selection import Selection
 
+from .._clips import lens
 from .._commands import COMMAND, INTERRUPTIBLE, one_after_another, still_earlier, write_earlier
 
 
@@ -256,6 +257,22 @@ def test_a_column_of_standard_deviations_that_would_not_count_is_refused(place, 
         "such as 2.1%, as most of it says, or 0 for focal lengths that are exact."
     )
     assert read("0") is not None
+
+
+def test_a_track_in_the_unit_of_the_lens_beside_it_is_in_no_other(tmp_path):
+    """The track of a clip that was calibrated by itself is in px, and was taken for mm."""
+    lens().save(tmp_path / "lens.json")  # in mm
+    track = tmp_path / "track.csv"
+    track.write_text("frame,focal\n0,500\n9,900\n")
+
+    def job(unit, focal=track):
+        return ImageJob((str(tmp_path / "a.mp4"),), focal=str(focal), focal_unit=unit)
+
+    assert job("mm").focal == str(track)
+    with pytest.raises(ValueError, match=r"track\.csv are in mm, .*: give argument focal_unit mm"):
+        job("px")
+    other = track.rename(tmp_path / "own.csv")
+    assert job("px", other).focal == str(other)
 
 
 @pytest.mark.slow

@@ -19,6 +19,7 @@ from .calibration import FILES
 from .focal_sources import MEASURED, check_source, focal_sigmas, refuse_sigma_column
 from .model_choice import WantedCentre, WantedModel
 from .plane_focals import SHARED_BY, Sharing
+from .relative import refuse_other_unit
 
 
 @dataclasses.dataclass(frozen=True)
@@ -83,6 +84,7 @@ class ImageJob:
         focal_sigmas("0" if self.focal_sigma is None else self.focal_sigma, np.ones(1))
         if self.video is not None and self.focal is not None:
             refuse_sigma_column(self.focal, self.focal_sigma)
+            refuse_other_unit(self.focal, self.focal_unit)
         self.model.check_centre(self.centre)
         if self.shared_focal is not None:
             self._check_sharing(self.shared_focal)

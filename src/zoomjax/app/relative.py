@@ -1,10 +1,13 @@
-"""Focal lengths of which only the ratios are known, as those of a clip that zooms without turning."""
+"""Tracks that belong to the lens beside them: of relative focal lengths, as of a clip that zooms without
+turning, and of focal lengths in its unit.
+"""
 
+import contextlib
 import warnings
 from pathlib import Path
 
 from ..models.about import RELATIVE
-from ..models.lens import ZoomLens
+from ..models.lens import ZoomLens, load_lens
 from ..trust.assessment import Finding
 
 NOTE = (
@@ -61,3 +64,16 @@ def is_relative_track(path: str | Path) -> bool:
         head = file.read(4 * len(NOTE))
     text = head.decode("utf-16" if head[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8", errors="replace")
     return text.lstrip('\ufeff"').startswith(NOTE.partition(":")[0])
+
+
+def refuse_other_unit(track: str, unit: str) -> None:
+    """Refuse a track of results in another unit than that of the lens.json beside it, which is its own."""
+    path, own = Path(track), unit
+    if path.name == "track.csv":
+        with contextlib.suppress(OSError, ValueError):
+            own = load_lens(path.with_name("lens.json")).focal_unit
+    if own != unit:
+        raise ValueError(
+            f"The focal lengths of {track} are in {own}, as those of the lens.json beside it: give "
+            f"argument focal_unit {own}."
+        )
