@@ -36,3 +36,16 @@ def test_nothing_is_heard_where_stderr_is_closed():
     )
     done = subprocess.run([sys.executable, "-c", code], stdout=subprocess.PIPE, check=True, text=True)
     assert done.stdout == "[]\n"
+
+
+def test_nothing_is_heard_where_no_temporary_file_can_be_made(capfd, monkeypatch):
+    """Else no photo could be read there."""
+
+    def refuse():
+        raise FileNotFoundError("No usable temporary directory found")
+
+    monkeypatch.setattr("zoomjax._core.quiet.tempfile.TemporaryFile", refuse)
+    with heard(re.compile(rb"from C")) as lines:
+        os.write(2, b"from C\n")
+    assert lines == []
+    assert capfd.readouterr().err == "from C\n"

@@ -36,17 +36,20 @@ def silent() -> Iterator[None]:
 def heard(ours: re.Pattern[bytes]) -> Generator[list[str], None, None]:
     """Lines that compiled code prints on stderr meanwhile and that begin like ours; there when it ends.
 
-    They are not printed then. Others are, such as those of other threads.
+    They are not printed then. Others are, such as those of other threads. Nothing is heard where stderr is
+    closed, or where no temporary file can be made.
     """
     lines: list[str] = []
     with _LOCK, contextlib.ExitStack() as stack:
         try:
             kept = os.dup(2)
-        except OSError:  # it is closed
+            stack.callback(os.close, kept)
+            file = stack.enter_context(tempfile.TemporaryFile())
+        except OSError:  # it is closed, or nothing can be written anywhere
+            file = kept = None
+        if file is None or kept is None:
             yield lines
             return
-        stack.callback(os.close, kept)
-        file = stack.enter_context(tempfile.TemporaryFile())
         with contextlib.suppress(OSError, ValueError, AttributeError):
             sys.stderr.flush()
         os.dup2(file.fileno(), 2)
