@@ -51,6 +51,42 @@ def real_argument(name: str, value: Any) -> Any:
     return numbers(name)(value)
 
 
+def settings(name: str) -> Callable[[Any], Any]:
+    """As `numbers`, of what a lens is set to in each frame: settings that differ by rounding are one.
+
+    Models, folds and covariances count distinct settings. A third that was computed is no other one than a
+    third that was read, nor is a number that was float32 once.
+    """
+    convert = numbers(name)
+
+    def one(value: Any) -> Any:
+        array = convert(value)
+        own = known(array)
+        if own is None or own.ndim != 1 or (same := _without_rounding(own)) is own:
+            return array
+        return same if isinstance(array, np.ndarray) else jnp.asarray(same)
+
+    return one
+
+
+def _without_rounding(values: np.ndarray) -> np.ndarray:
+    """The least of those that differ by rounding in place of each; the array itself if none do."""
+    order = np.argsort(values, kind="stable")
+    ordered = values[order]
+    with np.errstate(invalid="ignore"):
+        gap, most = np.diff(ordered), _SAME * abs(ordered[:-1])
+    if not np.any((gap > 0) & (gap <= most)):
+        return values
+    for place in range(1, len(ordered)):
+        if ordered[place] - ordered[place - 1] <= _SAME * abs(ordered[place - 1]):
+            ordered[place] = ordered[place - 1]
+    return ordered[np.argsort(order, kind="stable")]
+
+
+_SAME = 1e-6
+"""Part by which settings differ that are one: some last digits of float32, which cameras keep them in."""
+
+
 def host_numbers(name: str) -> Callable[[Any], Any]:
     """As `numbers`, but lists become NumPy arrays: what is computed from them needs no compilation."""
     return _converter(name, "real numbers", np.array)

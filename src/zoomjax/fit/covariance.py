@@ -293,7 +293,8 @@ def of_clusters(score, leverage, share, scores):
     total, independent = score.T @ score, xp.sum(share, axis=0)
     c = xp.sum(length) / _positive(xp.trace(independent))
     apart = xp.sum((total - c * independent) ** 2)
-    by_chance = xp.sum(length**2) - xp.sum(total**2) / _positive(xp.sum(length > 0))
+    telling = xp.sum(length > xp.finfo(length.dtype).eps * xp.sum(length))  # scores beyond rounding
+    by_chance = xp.sum(length**2) - xp.sum(total**2) / _positive(telling)
     shrink = xp.clip(by_chance / _positive(apart), 0, 1)
     shape = shrink * independent + (1 - shrink) * total / _positive(c)
     nu = xp.minimum(xp.trace(independent) ** 2 / _positive(xp.sum(share**2)), scores)

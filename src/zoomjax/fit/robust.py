@@ -242,8 +242,7 @@ def _reweighted(lines, start, narrowing):
 def _weights(lines, model, cut):
     """Tukey's weight of each line under a model; 0 for lines that are not there."""
     line_rms, median = _line_rms(lines, model)
-    better = (line_rms <= median) & _counted(lines)
-    spread = 1.4826 * _median(median - line_rms, better)
+    spread = 1.4826 * (median - _median(line_rms, _counted(lines), better_half=True))
     chance = median / jnp.sqrt(2 * jnp.maximum(lines.counts - 2, 1))
     rounding = rounded_by(lines.scale, line_rms.dtype)
     spread = jnp.sqrt(jnp.maximum(spread, _LEAST_SPREAD * median) ** 2 + chance**2 + rounding**2)
@@ -266,9 +265,14 @@ def _counted(lines):
     return (lines.counts > 2) & (_own_weights(lines) > 0)
 
 
-def _median(values, counted):
-    """The median of those that are counted; NaN of none. Unlike `jnp.nanmedian` it has a derivative."""
+def _median(values, counted, *, better_half=False):
+    """The median of those that are counted, or of the better half of them; NaN of none.
+
+    Unlike `jnp.nanmedian` it has a derivative. The half is by rank: lines of one RMS, as those that mirror
+    each other have, would by their values be in either half, as rounding has it.
+    """
     ordered = jnp.sort(jnp.where(counted, values, jnp.inf))
-    number = jnp.sum(counted)
+    all_of_them = jnp.sum(counted)
+    number = (all_of_them + 1) // 2 if better_half else all_of_them
     middle = (ordered[(number - 1) // 2] + ordered[number // 2]) / 2
     return jnp.where(number > 0, middle, jnp.nan)

@@ -41,6 +41,7 @@ from .._core.fields import (
     numbers,
     real_argument,
     refuse_masked,
+    settings,
 )
 from .._core.files import whole_file
 from .._core.products import EXACT
@@ -62,7 +63,8 @@ class Lines(AbstractLines):
         points: ``(x, y)`` px; (0, 0) is the centre of the top-left pixel.
         mask: which entries of `points` are points rather than padding.
         frame: index of the image that each line was seen in, into `focal`.
-        focal: focal length of each image, positive, in `focal_unit`.
+        focal: focal length of each image, positive, in `focal_unit`. Those that differ by less than a
+            millionth, as by rounding, are one: the least of them.
         centre: centre of distortion, px; the image's centre ``((w-1)/2, (h-1)/2)`` by default.
         image_size: (width, height) px.
         focal_unit: "mm" or "px".
@@ -75,13 +77,13 @@ class Lines(AbstractLines):
     points: Float[AnyArray, "line point 2"] = eqx.field(converter=numbers("points"))
     mask: Mask = eqx.field(converter=booleans("mask"))
     frame: FrameIndex = eqx.field(converter=integers("frame"))
-    focal: Focal = eqx.field(converter=numbers("focal"))
+    focal: Focal = eqx.field(converter=settings("focal"))
     centre: Point = eqx.field(converter=numbers("centre"))
     image_size: tuple[int, int] = eqx.field(static=True, converter=checked_size)
     focal_unit: str = eqx.field(static=True, default="mm")
     number: LineNumber | None = eqx.field(default=None, converter=integers("number"))
     weight: LineWeight | None = eqx.field(default=None, converter=numbers("weight"))
-    focus: Focus | None = eqx.field(default=None, converter=numbers("focus"))
+    focus: Focus | None = eqx.field(default=None, converter=settings("focus"))
 
     def __check_init__(self):
         """Check that the shapes agree, and that points are numbers where they are few."""

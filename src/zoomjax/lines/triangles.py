@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from .._core.checks import checked_size
-from .._core.fields import check_shapes, integers, numbers
+from .._core.fields import check_shapes, integers, numbers, settings
 from .._core.types import Focal, Focus, FrameIndex, LineNumber, LineWeight, Point
 from .base import AbstractLines, one_frame
 
@@ -23,13 +23,13 @@ class AbstractTriangles(AbstractLines):
 
     triangle: Float[Array, "line rows rows"] = eqx.field(converter=numbers("triangle"))
     frame: FrameIndex = eqx.field(converter=integers("frame"))
-    focal: Focal = eqx.field(converter=numbers("focal"))
+    focal: Focal = eqx.field(converter=settings("focal"))
     centre: Point = eqx.field(converter=numbers("centre"))
     image_size: tuple[int, int] = eqx.field(static=True, converter=checked_size)
     focal_unit: str = eqx.field(static=True)
     number: LineNumber | None = eqx.field(default=None, converter=integers("number"))
     weight: LineWeight | None = eqx.field(default=None, converter=numbers("weight"))
-    focus: Focus | None = eqx.field(default=None, converter=numbers("focus"))
+    focus: Focus | None = eqx.field(default=None, converter=settings("focus"))
 
     def __check_init__(self):
         """Check that the shapes agree."""

@@ -99,7 +99,10 @@ def compare_errors(candidates, errors, parts, rule, rounding=0.0):
     if not unseen:
         reasons = {e if isinstance(e, str) else e.problem for e in errors}
         raise ValueError(f"No candidate can be compared. {' '.join(sorted(reasons))}")
-    best = min(unseen, key=lambda i: _in_digits(weight @ unseen[i]))
+    roots = {i: np.sqrt(weight @ own) for i, own in unseen.items()}
+    least = min(roots.values())
+    equal = [i for i in roots if roots[i] <= least + max(_ROUNDING * least, rounding)]
+    best = min(equal, key=lambda i: round(errors[i].parameters, 6))  # of equal ones the simplest, the first
     compared = [
         _figures(candidate, judged, unseen.get(i), unseen[best], weight, by_unit)
         for i, (candidate, judged) in enumerate(zip(candidates, errors, strict=True))
