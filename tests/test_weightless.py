@@ -13,6 +13,8 @@ from zoomjax import scenes, trust
 from zoomjax.trust.centre_choice import choose_centre
 from zoomjax.trust.staged_selection import select_in_stages
 
+from .test_last_digits import mirrored
+
 WRONG = {"at both ends": (0, 7), "in between": (2, 4), "every other": (1, 3, 5, 7)}
 """Frames that are left out, of those at eight focal lengths."""
 
@@ -199,6 +201,17 @@ def test_the_next_photo(both):
 
     for part in range(3):
         same(lambda *lines, part=part: figures(*lines)[part], both)
+
+
+def test_a_robust_fit_with_its_centre():
+    few, t = mirrored(0.2), np.linspace(100.0, 400.0, 30)
+    crooked = [np.stack([t, y + 50 * np.sin(t / 40)], -1) for y in (200.0, 220.0)]
+    whole = zj.Lines.from_ragged(
+        [*few.to_ragged(), *crooked], [*np.asarray(few.frame), 0, 1], few.focal, image_size=few.image_size
+    ).weighted(np.repeat([1.0, 0.0], [len(few.frame), 2]))
+    first, second = (zj.fit_robust(lines, centre="fit").fit for lines in (whole, few))
+    np.testing.assert_allclose(first.rms, second.rms, rtol=1e-9)
+    np.testing.assert_allclose(first.lens.centre, second.lens.centre, rtol=1e-9)
 
 
 @pytest.mark.slow

@@ -147,7 +147,7 @@ def weights_for_any_centre(held: AbstractLines, model: Model) -> Float[AnyArray,
 
     best, tried = about(held.centre), held
     for _ in range(_CENTRES):
-        if not traced(best) and best.all():
+        if not traced(best) and best[np.asarray(_own_weights(held)) > 0].all():
             break
         found = fit_centre(tried, zoom=model, throw=False)
         other = about(found.fit.lens.centre)
