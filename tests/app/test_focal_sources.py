@@ -1,6 +1,7 @@
 """Focal lengths from every source, on rendered boards with exact truth."""
 
 import dataclasses
+from fractions import Fraction
 
 import jax.numpy as jnp
 import numpy as np
@@ -30,6 +31,17 @@ def test_exif_data_come_first():
     assert found.focal == {"a.jpg": 24.0, "b.jpg": 70.0}
     assert (found.unit, found.origin, found.deviation) == ("mm", "EXIF data", {})
     assert "EXIF" in found.absent
+
+
+def test_focal_lengths_that_differ_by_rounding_are_one():
+    """A camera's own fraction, its digits as float32, as editors write them, and the fraction of these."""
+    digits = float(np.float32(6.765))
+    again = float(Fraction(digits).limit_denominator(2**20))
+    given = {"a.jpg": 6765 / 1000, "b.jpg": digits, "c.jpg": again, "d.jpg": 6.77}
+    assert len(set(given.values())) == 4
+    found = choose_focals([of(*one) for one in given.items()])
+    assert len(set(found.focal.values())) == 2
+    np.testing.assert_allclose([*found.focal.values()], [*given.values()], rtol=1e-7)
 
 
 def test_deviations_of_a_table_are_read(tmp_path):

@@ -54,10 +54,21 @@ def test_flat_boards_are_worse_and_say_other_focal_lengths(lens, exact):
     assert abs(np.asarray(flat.focal) / [1000, 1600, 2600] - 1).max() > 2e-3
 
 
+def test_labels_that_differ_by_rounding_are_of_one_zoom(exact):
+    label = np.asarray(LABEL, float)
+    label[::2] *= 1 + 1e-7
+    fit, grids, _ = exact
+    other = fit_boards(grids, label, image_size=SIZE)
+    np.testing.assert_allclose(other.label, fit.label)
+    np.testing.assert_allclose(other.focal, fit.focal, rtol=1e-9)
+
+
 @pytest.mark.slow
 def test_the_same_photos_are_located_as_they_were_fitted(exact):
     fit, grids, _ = exact
     poses = fit.locate(grids[:5], LABEL[:5])
+    near = fit.locate(grids[:5], np.asarray(LABEL[:5]) * (1 - 1e-7))
+    np.testing.assert_allclose(near.rotation, poses.rotation)
     np.testing.assert_allclose(poses.rotation, fit.poses.rotation[:5], atol=1e-4)
     np.testing.assert_allclose(poses.position, fit.poses.position[:5], rtol=1e-3, atol=1e-3)
     assert np.asarray(poses.residual).max() < 0.1

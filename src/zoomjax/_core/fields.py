@@ -62,14 +62,14 @@ def settings(name: str) -> Callable[[Any], Any]:
     def one(value: Any) -> Any:
         array = convert(value)
         own = known(array)
-        if own is None or own.ndim != 1 or (same := _without_rounding(own)) is own:
+        if own is None or own.ndim != 1 or (same := without_rounding(own)) is own:
             return array
         return same if isinstance(array, np.ndarray) else jnp.asarray(same)
 
     return one
 
 
-def _without_rounding(values: np.ndarray) -> np.ndarray:
+def without_rounding(values: np.ndarray) -> np.ndarray:
     """The least of those that differ by rounding in place of each; the array itself if none do."""
     order = np.argsort(values, kind="stable")
     ordered = values[order]

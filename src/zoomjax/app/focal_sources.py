@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from .._core.fields import without_rounding
 from .._core.types import AnyArray
 from ..detect.batch import Detection
 from ..fit.frames import fit_frames
@@ -76,6 +77,10 @@ class Focals:
     known: bool = True
     one_zoom: bool | None = None
     instead: dict[str, float] = dataclasses.field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        same = without_rounding(np.array([*self.focal.values()], float))
+        object.__setattr__(self, "focal", dict(zip(self.focal, same.tolist(), strict=True)))
 
     def deviating_by(self, deviation: dict[str, float]) -> "Focals":
         """The same with other standard deviations."""

@@ -7,7 +7,7 @@ from jaxtyping import Array, Float, Int
 
 from .._core.arrays import as_jax
 from .._core.checks import checked_size
-from .._core.fields import refuse_masked
+from .._core.fields import refuse_masked, without_rounding
 from .._core.types import traced
 from ..lines.buckets import bucket as bucket_of
 from ._board_rows import Data
@@ -78,7 +78,7 @@ def checked_grids(grids, focal, board, image_size, shape: tuple[int, ...] | None
             f"Argument grids must have {LEAST_CORNERS} corners or more in each photo, but number "
             f"{int(count.argmin())} has {count.min()}: leave it out."
         )
-    return Given(stack, label, number, checked_size(image_size))
+    return Given(stack, without_rounding(label), number, checked_size(image_size))
 
 
 def data_of(

@@ -19,6 +19,7 @@ from jaxtyping import Array, Float, Int, Num
 from .._core.arguments import kinds_checked
 from .._core.arrays import as_jax
 from .._core.checks import check_above
+from .._core.fields import without_rounding
 from .._core.programs import light_program
 from .._core.types import AnyArray
 from ..models.distortion_model import AbstractDistortionModel, checked_terms
@@ -138,9 +139,10 @@ class BoardFit(eqx.Module):
             ValueError: a grid has another size, or a label or a board is not among those fitted.
         """
         given = checked_grids(grids, focal, board, self.lens.image_size, self.shape.shape[1:3])
-        known, lens = np.asarray(self.label), self.lens
-        number = np.searchsorted(known, given.label).clip(0, len(known) - 1)
-        strange = known[number] != given.label
+        lens, zooms = self.lens, len(self.label)
+        known, label = np.split(without_rounding(np.append(self.label, given.label)), [zooms])
+        number = np.searchsorted(known, label).clip(0, zooms - 1)
+        strange = known[number] != label
         if strange.any():
             raise ValueError(
                 f"Argument focal must be among the labels fitted, {known.tolist()}, but it holds "
@@ -152,7 +154,7 @@ class BoardFit(eqx.Module):
                 f"Argument board must be among the {boards} boards fitted, from 0, but it holds "
                 f"{given.board.max()}."
             )
-        data = data_of(given, number, len(known), np.asarray(lens.centre), _HELD, boards=boards)
+        data = data_of(given, number, zooms, np.asarray(lens.centre), _HELD, boards=boards)
         coefficients = padded_to(np.asarray(jax.vmap(lens.zoom)(self.focal)), len(data.smooth))
         matrices, *_ = _homographies(data, coefficients, lens.distortion_model)
         start = _model(
