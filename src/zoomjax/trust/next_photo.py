@@ -143,14 +143,15 @@ def suggest_next(
     candidates = jnp.asarray(candidate_lines(fit.lens.image_size, length), dtype)
     grid = jnp.asarray(focals, dtype)
     known = _known(lines, fit.lens.zoom, weights, counts)
-    rows, squared = map(np.asarray, _derivatives(fit.lens, candidates, grid))
+    rows, of_points = (np.asarray(part, float) for part in _derivatives(fit.lens, candidates, grid))
+    squared = of_points.swapaxes(-1, -2) @ of_points / of_points.shape[-2]
     points = _image_grid(fit.lens.image_size).astype(dtype)[:, None]
     before = np.asarray(displacement_std(fit, points, focal=grid))
     with np.errstate(all="ignore"):
         before = float(_average(before.ravel()))
-        now, table = _bands(known, rows, squared, number * points_each)
+        now, table = _bands(known, rows, squared, number * points_each, float(np.finfo(dtype).eps))
     # What was measured of the noise is in `before`; how a photo changes it is the ratio.
-    table = np.nan_to_num(np.asarray(table, np.float64), nan=np.inf)  # what rounding alone is left of
+    table = np.nan_to_num(table, nan=np.inf)  # what rounding alone is left of
     if np.isfinite(before) and float(now) > 0:
         table = before * (table / float(now))
     at_focal, _, in_direction = np.unravel_index(np.argmin(table), table.shape)
@@ -237,7 +238,7 @@ class _Known(NamedTuple):
 
 
 def _known(lines, zoom, weights, counts) -> _Known:
-    weighted, jacobian, *_ = map(np.asarray, by_parameters(lines, zoom))
+    weighted, jacobian, *_ = (np.asarray(part, float) for part in by_parameters(lines, zoom))
     information = np.einsum("lri,lrj->lij", jacobian, jacobian)
     freedom = np.sum(weights * (counts - 2))
     counted = weights > 0
@@ -250,19 +251,21 @@ def _known(lines, zoom, weights, counts) -> _Known:
     )
 
 
-def _bands(known, rows, squared, counts):
+def _bands(known, rows, squared, counts, digits):
     """The mean standard deviation of the displacement now, and with each candidate, of so many points.
 
-    For independent points; `rows` and `squared` are those of `_derivatives`. A frame more has the weight of
-    one in eq. 13, and its lines and points equal shares.
+    For independent points; `rows` are those of `_derivatives`, rounded by `digits`, and `squared` the means
+    of the squares of the others. A frame more has the weight of one in eq. 13, and its lines and points
+    equal shares. In float64: squares have twice as many digits as what they are squares of.
     """
     information, noise, variance, points_counted, frames = known
-    eps, tiny = np.finfo(rows.dtype).eps, np.finfo(rows.dtype).tiny
-    eye = np.eye(rows.shape[-1], dtype=rows.dtype)
+    eps, tiny = np.finfo(float).eps, np.finfo(float).tiny
+    eye = np.eye(rows.shape[-1])
 
     def typical(information, noise):
         """Of the estimate with the prior: a variance of 1 for each parameter, weighed as a point is."""
-        rounding = 64 * eps * np.trace(information, axis1=-2, axis2=-1) + tiny
+        lost = 64 * max(eps, 64 * digits**2)
+        rounding = lost * np.trace(information, axis1=-2, axis2=-1) + tiny
         ridge = np.maximum(variance / points_counted, rounding)  # lines without noise would leave nothing
         ridge = ridge[..., None, None] * eye
         inverse = np.linalg.inv(information + ridge)
@@ -280,8 +283,7 @@ def _bands(known, rows, squared, counts):
 def _derivatives(lens, candidates, focals):
     """Derivatives by the parameters of where points all over the image go, at all focal lengths: (n, 2, p).
 
-    And for each focal length and candidate the mean over its points of the squared derivatives of their
-    residuals, (p, p).
+    And for each focal length and candidate those of the residuals of its points: (..., n, p).
     """
     flat, unravel = ravel_pytree(lens.zoom.parameters)
     everywhere = _image_grid(lens.image_size).astype(flat.dtype)
@@ -296,8 +298,7 @@ def _derivatives(lens, candidates, focals):
 
     def of_candidate(lines, focal):
         each = jax.vmap(jax.jacfwd(residuals), (None, 0, None))(flat, lines, focal)
-        each = each.reshape(-1, flat.size)
-        return each.T @ each / each.shape[0]
+        return each.reshape(-1, flat.size)
 
     rows = jax.vmap(jax.jacfwd(corrected), (None, None, 0))(flat, everywhere, focals)
     over = jax.vmap(jax.vmap(jax.vmap(of_candidate, (0, None)), (0, None)), (None, 0))
