@@ -108,3 +108,34 @@ def test_focal_lengths_that_are_others_stay():
     assert np.asarray(with_focal(mirrored(), focal).focal).tolist() == focal.tolist()
     many = 20 * (1 + 5e-7 * np.arange(4))  # each is near the next one, but not all near the first
     assert np.asarray(with_focal(mirrored(), many).focal).tolist() == [many[0]] * 3 + [many[3]]
+
+
+# float32 is enough, if what is squared is not
+
+
+@pytest.fixture(scope="module")
+def in_both():
+    """Lines at 20 to 30 mm, which hardly tell a model of degree 2, in both dtypes, and their fits."""
+    focal = np.array([20.56, 22.0, 24.0, 27.0, 30.0])
+    lines = zj.scenes.board_lines(zj.scenes.nikkor_18_200((640, 424)), focal, spacing=12, noise=0.1)
+    points = [np.asarray(line, np.float32) for line in lines.to_ragged()]
+    single = zj.Lines.from_ragged(points, lines.frame, np.float32(focal), image_size=lines.image_size)
+    return [(each, zj.fit_zoom(zj.compress(each))) for each in (lines, single)]
+
+
+def test_uncertain_focal_lengths_in_single_precision(in_both):
+    """Their error moves the model along what lines hardly tell, which float32 lost: 8 times in variance."""
+    wider = [
+        zj.fit.with_focal_sigma(fit, zj.compress(lines), focal_sigma=0.01 * np.asarray(lines.focal))
+        for lines, fit in in_both
+    ]
+    assert wider[1].covariance.dtype == np.float32
+    np.testing.assert_allclose(np.diag(wider[1].covariance), np.diag(wider[0].covariance), rtol=1e-3)
+
+
+def test_halves_of_lines_in_single_precision(in_both):
+    halves = [zj.trust.evidence(lines, fit).halves for lines, fit in in_both]
+    assert [one.parting for one in halves[0]] == [one.parting for one in halves[1]]
+    for one, other in zip(*halves, strict=True):
+        assert other.apart == pytest.approx(one.apart, rel=5e-3)
+        assert other.expected == pytest.approx(one.expected, rel=5e-3)

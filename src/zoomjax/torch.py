@@ -24,6 +24,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ._core.arrays import widest
 from .correct.framing import Framing
 from .correct.warp import warp_image as _warp_image
 from .models.distortion import Distortion
@@ -239,8 +240,7 @@ def _precision(dtype):
     """JAX as wide as the tensors, for a while: it would make float32 of float64 without a word."""
     if dtype != torch.float64 or jnp.result_type(float) == jnp.float64:
         return contextlib.nullcontext()
-    switch: Any = jax  # before 0.8 it is in jax.experimental
-    return switch.enable_x64(True) if hasattr(switch, "enable_x64") else switch.experimental.enable_x64()
+    return widest()
 
 
 def _to_jax(tensors):

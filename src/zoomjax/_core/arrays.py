@@ -3,6 +3,7 @@
 And what is done with arrays in several rooms.
 """
 
+import contextlib
 import math
 from collections.abc import Callable
 from typing import Any
@@ -10,6 +11,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+
+from .types import traced
 
 
 def namespace(*values: Any) -> Any:
@@ -67,6 +70,36 @@ def held_as_given(array: np.ndarray) -> Any:
 def as_jax(values: Any) -> jax.Array:
     """A JAX array of these numbers, by no program: `jnp.asarray` compiles one for each shape of NumPy's."""
     return values if isinstance(values, jax.Array) else jax.device_put(values)
+
+
+def widest(on: bool = True) -> contextlib.AbstractContextManager:
+    """JAX's widest type, or not, in this thread: as `jax_enable_x64`, for a while."""
+    switch: Any = jax  # before 0.8 it is in jax.experimental
+    return switch.enable_x64(on) if hasattr(switch, "enable_x64") else switch.experimental.enable_x64(on)
+
+
+def in_float64(function: Callable[..., Any], *given: Any) -> Any:
+    """What a function gives of arrays that are known, computed in float64, in the widest of their dtypes.
+
+    For what float32 has no room for, as products of derivatives that are nearly alike. Of traced arrays it
+    is computed in their own dtype.
+    """
+    own = [leaf.dtype for leaf in jax.tree.leaves(given) if _is_real(leaf)]
+    dtype = np.result_type(*own) if own else np.dtype(float)
+    if dtype == np.float64 or traced(given):
+        return function(*given)
+    with widest():
+        result = function(*(_cast(one, np.dtype(float)) for one in given))
+        result = jax.tree.map(np.asarray, result)
+    return jax.tree.map(jnp.asarray, _cast(result, dtype))
+
+
+def _is_real(leaf: Any) -> bool:
+    return hasattr(leaf, "dtype") and jnp.issubdtype(leaf.dtype, jnp.floating)
+
+
+def _cast(tree: Any, dtype: np.dtype) -> Any:
+    return jax.tree.map(lambda leaf: np.asarray(leaf, dtype) if _is_real(leaf) else leaf, tree)
 
 
 def finite(values: Any) -> Any:

@@ -22,6 +22,7 @@ from typing import Any, Generic, NamedTuple, TypeVar
 import jax
 import numpy as np
 
+from .arrays import widest
 from .copies import Origin, have_copy, origin_of
 from .text import reason
 
@@ -224,7 +225,7 @@ def _away(
     file: _Seen | None,
 ) -> tuple[Any, list[tuple[str, type[Warning]]]]:
     """In a worker: the result of a task, and its warnings, where nobody would see them."""
-    with _float64(wide):
+    with widest(wide):
         if _here() == home:
             return task(item), []
         if file and file.origin:
@@ -236,12 +237,6 @@ def _away(
             return task(item), _own.told
         finally:
             _own.away, _own.told = False, None
-
-
-def _float64(on: bool) -> contextlib.AbstractContextManager:
-    """JAX's widest type in this thread."""
-    switch: Any = jax
-    return switch.enable_x64(on) if hasattr(switch, "enable_x64") else switch.experimental.enable_x64(on)
 
 
 @functools.cache

@@ -23,6 +23,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int, Num, ScalarLike
 
 from .._core.arguments import kinds_checked
+from .._core.arrays import in_float64
 from .._core.fields import integers, real_argument
 from .._core.types import AnyArray, Focal, traced
 from ..lines.base import AbstractLines
@@ -75,7 +76,7 @@ def with_focal_sigma(
     sigma, together = _checked_errors(fit, lines, focal_sigma, shared)
     lines = placed_as(fit.lens, lines)
     own = (fit.lens.zoom, fit.covariance, fit.joint)
-    return with_covariances(fit, *_widened_by(lines, *own, sigma, together))
+    return with_covariances(fit, *in_float64(_widened_by, lines, *own, sigma, together))
 
 
 def effects_of_focal(
@@ -89,7 +90,7 @@ def effects_of_focal(
         fit, lines, focal_sigma, shared: see `with_focal_sigma`; the lines about the centre of the fit.
     """
     sigma, together = _checked_errors(fit, lines, focal_sigma, shared)
-    moves = jax.tree.map(np.asarray, _moves(lines, fit.lens.zoom))
+    moves = jax.tree.map(np.asarray, in_float64(_moves, lines, fit.lens.zoom))
     number, relative = len(sigma), np.asarray(sigma) / np.asarray(lines.focal)
     _, error = np.unique(np.asarray(together), return_inverse=True)
     by_fit = np.zeros((len(moves.response), error.max() + 1))

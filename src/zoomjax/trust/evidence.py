@@ -316,8 +316,11 @@ def _half(prior: np.ndarray, gram: np.ndarray, gradient: np.ndarray) -> _Half | 
 def _normal_terms(
     lines: AbstractLines, zoom: AbstractZoom
 ) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
-    """The normal matrix of the prior; that of each line, and its gradient with a share of the prior's."""
-    residuals, jacobian, prior, prior_gradient = map(np.asarray, by_parameters(lines, zoom))
+    """The normal matrix of the prior; that of each line, and its gradient with a share of the prior's.
+
+    In float64: squares have twice as many digits as what they are squares of.
+    """
+    residuals, jacobian, prior, prior_gradient = (np.asarray(p, float) for p in by_parameters(lines, zoom))
     gram = np.einsum("lrp,lrq->lpq", jacobian, jacobian)
     gradient = np.einsum("lrp,lr->lp", jacobian, residuals) + 2 * prior_gradient / len(residuals)
     return prior.T @ prior, (gram, gradient)

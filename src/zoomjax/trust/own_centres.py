@@ -66,7 +66,7 @@ def own_centres(fit: ZoomFit, lines: AbstractLines) -> OwnCentres | None:
     both = np.concatenate([k, np.broadcast_to(offset, (len(k), 2))], axis=1)
     few = for_terms(with_distortion_model(lines, lens.distortion_model), k.shape[1])
     dtype = jnp.asarray(lines.focal).dtype
-    rows, by_own = map(np.asarray, by_coefficients(few, np.asarray(both, dtype)))
+    rows, by_own = (np.asarray(p, float) for p in by_coefficients(few, np.asarray(both, dtype)))
     score, matrix = np.einsum("lri,lr->li", by_own, rows), np.einsum("lri,lrj->lij", by_own, by_own)
     used = own_weights(lines) > 0
     frame, centre, std = np.asarray(lines.frame), *np.full((2, len(k), 2), np.nan)
