@@ -54,7 +54,8 @@ def with_focal_sigma(
             the zoom whose focal length was measured once.
 
     Returns:
-        The fit whose `covariance` includes them, to first order. A fit that does not know of the errors
+        The fit whose `covariance` includes them, to first order, computed in float64; under ``jit`` in the
+        lines' dtype, and float32 may lose what lines hardly tell. A fit that does not know of the errors
         allows for photos that scatter more than their lines: what the errors explain of that is taken out.
         A fitted centre is held where it is in each frame, also one that moves along the zoom.
 
