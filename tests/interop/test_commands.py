@@ -7,6 +7,7 @@ import sys
 import pytest
 
 import zoomjax as zj
+from zoomjax.app.results_folder import results_folder
 
 from .._commands import SEVERAL
 from ._lenses import LENSES, PITCH
@@ -39,6 +40,8 @@ def told(tmp_path_factory):
     (folder / "in").mkdir()
     lens = LENSES["landscape"]()
     zj.interop.write(lens, folder / "in" / "lens.json", format="gyroflow", pixel_pitch=PITCH)
+    with results_folder(folder / "mine", ["lens.json"]) as part:  # as calibrate does
+        lens.save(part / "lens.json")
     before = {path: path.read_bytes() for path in inputs_in(folder)}
     lines = {
         "formats": "formats",
@@ -50,6 +53,8 @@ def told(tmp_path_factory):
         "no focal": "export lens.json --to pftrack -o b.pfb",
         "no format": "export lens.json --to that -o b.pfb",
         "import": "import a.xml --image-size 640x480 -o back",
+        "import again": "import a.xml --image-size 640x480 -o back",
+        "import over": "import a.xml --image-size 640x480 -o mine",
         "import division": "import a.pfb --focal 20,30,40 --distortion-model division --terms 1 -o other",
         "in px": "import a.pfb --focal 500,700,1100 --focal-unit px -o pixels",
         "no numbers": "import a.pfb -o never",
@@ -99,6 +104,7 @@ def test_a_lens_goes_out_and_comes_back(told):
     assert "px between." in text
     assert said["overwrite"][0] == 0
     assert (folder / "a.pfb").read_text().startswith("#PFBarrel")
+    assert said["import again"][0] == 0
     status, text = said["import"]
     assert status == 0, text
     assert zj.load_lens(folder / "back" / "lens.json").focal_unit == "mm"
@@ -129,6 +135,10 @@ def test_the_model_of_an_import_can_be_chosen(told):
     ("name", "sentence"),
     [
         ("again", "a.xml already exists and would be replaced: choose another place, or give --overwrite."),
+        (
+            "import over",
+            "mine/lens.json already exists and would be replaced: choose another place, or give",
+        ),
         ("no pitch", "Error: --pixel-pitch, mm from one pixel to the next"),
         ("no focal", "Error: --focal must be given, one focal length or several"),
         ("no format", "Error: --to must be one of stmap, nuke"),

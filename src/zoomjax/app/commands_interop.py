@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from .._core.files import refuse_inputs
+from .._core.files import refuse_existing, refuse_inputs
 from .._core.text import plain
 from ._jax import set_up_jax
 from .arguments import Overwrite, lens_file, size_of
@@ -196,6 +196,8 @@ def import_(
 
     inputs = list(source.iterdir()) if source.is_dir() else [source]
     refuse_inputs([output / name for name in RESULTS], inputs)
+    if not (output / RESULTS[1]).exists():  # else it was imported, too, and not measured
+        refuse_existing([output / RESULTS[0]], overwrite=overwrite)
     found = read(
         source,
         format=of,
