@@ -203,6 +203,7 @@ def test_lines_are_fitted_again_where_they_are(calibrated, tmp_path):
     assert after["lens.json"] != before["lens.json"]
     old, new = (json.loads(content["summary.json"]) for content in (before, after))
     assert new["rms_none"] != old["rms_none"]  # without two lines
+    assert f" lines, {len(new['rejected'])} left out, in " in done.stdout
     assert len(new["parameters"]) < len(old["parameters"])
     again = zoomjax("calibrate", "lines.npz", "-o", ".", "--dry-run", cwd=folder)
     assert again.returncode == 0, again.stderr

@@ -166,8 +166,9 @@ def show_calibration(
     summary = calibration.summary()
     unit = summary["focal_unit"]
     show_verdict(calibration)
+    out = f", {summary['rejected_lines']} left out," * (summary["rejected_lines"] > 0)
     console.print(
-        f"\n{summary['points']:,} points on {summary['lines']:,} lines in "
+        f"\n{summary['points']:,} points on {summary['lines']:,} lines{out} in "
         f"{summary['frames']} frame{'s' * (summary['frames'] > 1)}, "
         f"{calibration.focal_text()}\n",
         highlight=False,
