@@ -201,3 +201,43 @@ def test_a_model_with_parameters_tells_the_number_of_coefficients(photos):
     for use in uses:
         with pytest.raises(ValueError, match="the parameters of zoom are for 3"):
             use()
+
+
+# Several in one, as `jax.vmap` and ``jax.tree.map(jnp.stack)`` make
+
+
+def two(one):
+    return jax.tree.map(lambda leaf: jnp.stack([jnp.asarray(leaf)] * 2), one)
+
+
+OF_TWO = {
+    "compress": lambda lines, _: zj.compress(two(lines)),
+    "fit_zoom": lambda lines, _: zj.fit_zoom(two(lines)),
+    "fit_frames": lambda lines, _: zj.fit_frames(two(zj.compress(lines))),
+    "select_model": lambda lines, _: zj.select_model(two(lines)),
+    "many": lambda lines, _: zj.fit.many([lines, two(lines)]),
+    "concatenate": lambda lines, _: zj.fit.concatenate([two(zj.compress(lines))]),
+    "frame_rms": lambda lines, fit: zj.frame_rms(lines, two(fit.lens)),
+    "certify": lambda _, fit: zj.models.certify(two(fit.lens)),
+    "displacement_rms": lambda _, fit: zj.trust.displacement_rms(fit.lens, two(fit.lens)),
+    "displacement_std": lambda _, fit: zj.displacement_std(two(fit), np.zeros((1, 2)), focal=30.0),
+    "assess": lambda lines, fit: zj.trust.assess(lines, two(fit)),
+    "vanishing_points": lambda lines, fit: zj.trust.vanishing_points(lines, two(fit.lens)),
+    "write": lambda _, fit: zj.interop.write(two(fit.lens), "a.pfb", focal=30),
+    "to_ragged": lambda lines, _: two(lines).to_ragged(),
+}
+
+
+@pytest.mark.parametrize("name", OF_TWO)
+def test_several_in_one_are_refused_by_name(name, noisy, fit, unchecked, tmp_path, monkeypatch):
+    """`to_ragged` took two sets of lines for two lines; others raised what JAX says of shapes."""
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ValueError, match=r"holds 2 of its kind in one: call the function by jax\.vmap"):
+        OF_TWO[name](noisy, fit)
+
+
+def test_several_in_one_under_vmap(small, fit):
+    each = jax.vmap(lambda lines: zj.fit_zoom(lines, throw=False).rms)(two(small))
+    np.testing.assert_allclose(each, np.repeat(np.asarray(zj.fit_zoom(small).rms), 2), rtol=1e-6)
+    least = jax.vmap(lambda lens: zj.models.certify(lens).least)(two(fit.lens))
+    np.testing.assert_allclose(least, np.repeat(np.asarray(fit.certificate.least), 2), rtol=1e-5)

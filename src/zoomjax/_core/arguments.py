@@ -74,9 +74,26 @@ _INSTEAD = {
 """What to pass instead of something that is near to what is wanted."""
 
 
+_OF_ONE_AXIS = {
+    **dict.fromkeys(("AbstractLines", "Lines", "CompressedLines"), "focal"),
+    "ZoomLens": "focal_range",
+    **dict.fromkeys(("ZoomFit", "FrameFits"), "frame_rms"),
+}
+"""An array of one axis, by the first of the classes: with more it is of several objects in one."""
+
+
 def check_kind(name: str, value: Any, kinds: tuple[type, ...]) -> None:
-    """Raise TypeError where a value is of none of these kinds."""
+    """Raise TypeError where a value is of none of these kinds.
+
+    And ValueError where it is of several in one, as `jax.vmap` and ``jax.tree.map(jnp.stack)`` make.
+    """
     if isinstance(value, kinds):
+        array = getattr(value, _axis(kinds), None)
+        if getattr(array, "ndim", 0) > 1:
+            raise ValueError(
+                f"Argument {name} holds {np.shape(array)[0]} of its kind in one: call the function by "
+                f"jax.vmap, or for each, of which jax.tree.map(lambda leaf: leaf[0], {name}) is the first."
+            )
         return
     first = kinds[0].__name__
     wanted = _WANTED.get(first) or " or ".join(kind.__name__ for kind in kinds)
@@ -117,13 +134,19 @@ def kinds_checked(function: Callable[Parameters, Result]) -> Callable[Parameters
                 check_flag(name, args[place] if place < len(args) else kwargs[name])
         for name, (place, kinds, default) in wanted.items():
             value = args[place] if place < len(args) else kwargs.get(name, default)
-            if not isinstance(value, kinds) and value is not inspect.Parameter.empty:
+            if value is not inspect.Parameter.empty:
                 check_kind(name, value, kinds)
         for name, value in (*zip(parameters, args, strict=False), *kwargs.items()):
             refuse_masked(name, value)
         return function(*args, **kwargs)
 
     return checked
+
+
+@functools.cache
+def _axis(kinds: tuple[type, ...]) -> str:
+    """The array of one axis of objects of these classes; empty if there is none."""
+    return next((_OF_ONE_AXIS[kind.__name__] for kind in kinds if kind.__name__ in _OF_ONE_AXIS), "")
 
 
 def _kinds(annotation: Any) -> tuple[type, ...]:

@@ -24,7 +24,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._core.arguments import kinds_checked
+from .._core.arguments import check_kind, kinds_checked
 from .._core.programs import program
 from .._core.types import of_known_values
 from ..lines.base import AbstractLines
@@ -176,6 +176,7 @@ def data_sets(lines: Any) -> list[AbstractLines]:
                 "Argument lines must be a list of Lines or compress(lines), but the type of its element "
                 f"{number} is {type(one).__name__}."
             )
+        check_kind(f"lines[{number}]", one, (AbstractLines,))
     return list(lines)
 
 

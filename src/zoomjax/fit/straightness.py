@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._core.arguments import kinds_checked
+from .._core.arguments import check_kind, kinds_checked
 from .._core.arrays import as_jax
 from .._core.fields import real_argument
 from .._core.types import AnyArray
@@ -40,6 +40,7 @@ def frame_rms(
     If the lens folds, points beyond the fold are corrected by the formula.
     """
     if isinstance(lens, ZoomLens):
+        check_kind("lens", lens, (ZoomLens,))
         check_camera(lens, lines)
         lens.check_range(lines.focal)
         lines = placed_as(lens, lines)

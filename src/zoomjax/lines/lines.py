@@ -225,6 +225,7 @@ class Lines(AbstractLines):
 
     def to_ragged(self) -> list[np.ndarray]:
         """The points of each line as an (n, 2) array, as for `from_ragged`."""
+        check_kind("lines", self, (Lines,))
         mask = np.asarray(self.mask)
         return [line[keep] for line, keep in zip(np.asarray(self.points), mask, strict=True)]
 
