@@ -88,7 +88,7 @@ def check_kind(name: str, value: Any, kinds: tuple[type, ...]) -> None:
     And ValueError where it is of several in one, as `jax.vmap` and ``jax.tree.map(jnp.stack)`` make.
     """
     if isinstance(value, kinds):
-        array = getattr(value, _axis(kinds), None)
+        array: Any = getattr(value, _axis(kinds), None)
         if getattr(array, "ndim", 0) > 1:
             raise ValueError(
                 f"Argument {name} holds {np.shape(array)[0]} of its kind in one: call the function by "
