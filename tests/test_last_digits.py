@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import zoomjax as zj
+from zoomjax._core.arrays import widest
 from zoomjax.models import Division
 
 SIZE = (960, 640)
@@ -131,6 +132,21 @@ def test_uncertain_focal_lengths_in_single_precision(in_both):
     ]
     assert wider[1].covariance.dtype == np.float32
     np.testing.assert_allclose(np.diag(wider[1].covariance), np.diag(wider[0].covariance), rtol=1e-3)
+
+
+def test_uncertain_focal_lengths_without_x64(in_both):
+    """Points of NumPy stay float64 then, and are computed with in float32."""
+    (lines, fit), _ = in_both
+    sigma = 0.01 * np.asarray(lines.focal)
+    expected = zj.fit.with_focal_sigma(fit, zj.compress(lines), focal_sigma=sigma).covariance
+    with widest(False):
+        given = zj.Lines.from_ragged(
+            lines.to_ragged(), lines.frame, np.asarray(lines.focal), image_size=lines.image_size
+        )
+        small = zj.compress(given)
+        wider = zj.fit.with_focal_sigma(zj.fit_zoom(small), small, focal_sigma=sigma)
+    assert wider.covariance.dtype == np.float32
+    np.testing.assert_allclose(np.diag(wider.covariance), np.diag(expected), rtol=1e-3)
 
 
 def test_halves_of_lines_in_single_precision(in_both):

@@ -85,7 +85,8 @@ def in_float64(function: Callable[..., Any], *given: Any) -> Any:
     is computed in their own dtype.
     """
     own = [leaf.dtype for leaf in jax.tree.leaves(given) if _is_real(leaf)]
-    dtype = np.result_type(*own) if own else np.dtype(float)
+    # Without x64 JAX computes with arrays of NumPy in float32, whatever theirs is.
+    dtype = jax.dtypes.canonicalize_dtype(np.result_type(*own) if own else float)
     if dtype == np.float64 or traced(given):
         return function(*given)
     with widest():
