@@ -459,6 +459,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "motion-broadcast": motion("Frames of a broadcast"),
     "motion-rivals": motion("Rivals"),
     "motion-shots": motion("Shots across a cut"),
+    "motion-lenses": motion("Shots of one camera and of two"),
     "motion-tracking": motion("Tracking"),
     "motion-time": motion("Time"),
 }

@@ -89,7 +89,7 @@ def test_a_fit_that_still_moves_after_all_its_turns_has_not_settled(problem, sta
 
     monkeypatch.setattr(_motion_stages, "_solved", restless)
     monkeypatch.setattr(_motion_stages, "_MOST_REPEATS", 2)
-    parts, *_ = in_stages(problem.data, model, noise, problem.scene)
+    parts, *_ = in_stages(problem.data, model, noise, problem.scene, problem.linked)
     assert parts["fit"].result == RESULTS.nonlinear_max_steps_reached
 
 
@@ -116,11 +116,11 @@ def test_changes_in_a_long_clip_are_those_of_its_parts_in_the_mean(problem):
 def test_a_first_frame_that_does_not_fit_the_others_finds_its_way(problem, starts, monkeypatch):
     """All others would have to move back: too dear in a long clip, or in a short one with less freedom."""
     model, noise = chosen(problem, starts)
-    expected, *_ = in_stages(problem.data, model, noise, problem.scene)
+    expected, *_ = in_stages(problem.data, model, noise, problem.scene, problem.linked)
     path = model.path._replace(log_focal=model.path.log_focal.at[0].add(-0.12))
     model = eqx.tree_at(lambda m: m.path, model, path)
     monkeypatch.setattr(_motion_stages, "STAGES", (*STAGES[:2], STAGES[2]._replace(own=0.005)))
-    parts, *_ = in_stages(problem.data, model, noise, problem.scene)
+    parts, *_ = in_stages(problem.data, model, noise, problem.scene, problem.linked)
     std = np.asarray(expected["focal_std"])[:FRAMES]
     off = np.abs(np.asarray(parts["focal"]) - np.asarray(expected["focal"]))[:FRAMES]
     np.testing.assert_array_less(off, 0.3 * std)

@@ -1,6 +1,7 @@
 """Rendered clips with a cut: shots of one scene are joined, and others are not."""
 
 import dataclasses
+import json
 from functools import partial
 
 import cv2
@@ -22,8 +23,9 @@ from .._clips import write_frames
 SIZE, CUT, FRAMES = (640, 360), 20, 40
 
 
-def lens():
-    zoom = zj.PolynomialZoom(2, jnp.array([[0.02, 0.0], [-0.05, 0.01], [-0.1, 0.03]]), jnp.array(500.0))
+def lens(distortion=1.0):
+    k = distortion * jnp.array([[0.02, 0.0], [-0.05, 0.01], [-0.1, 0.03]])
+    zoom = zj.PolynomialZoom(2, k, jnp.array(500.0))
     return zj.ZoomLens(zoom, jnp.array([322.0, 178.0]), jnp.array([500.0, 1200.0]), SIZE, "px")
 
 
@@ -38,13 +40,13 @@ def shots():
     return shot((-15, 10), (0, 3), (520, 800)), shot((30, 2), (5, 2), (640, 1100))
 
 
-def rendered(path, seeds, *, caption=False, shutter=0.0):
+def rendered(path, seeds, *, caption=False, shutter=0.0, lenses=None):
     """A clip of both shots, before panoramas of these seeds."""
     frames = []
-    for part, seed in zip(shots(), seeds, strict=True):
+    for part, seed, of in zip(shots(), seeds, lenses or (lens(), lens()), strict=True):
         texture = leaves(seed=seed)
         made = motion_clip(
-            lens(), *part, texture=texture, noise=2, caption=caption, shutter=shutter, density=1200.0
+            of, *part, texture=texture, noise=2, caption=caption, shutter=shutter, density=1200.0
         )
         frames += list(made.frames())
     return write_frames(path, frames)
@@ -111,6 +113,22 @@ def test_shots_of_different_scenes_are_not_joined(done, folder, caption):
     apart = eqx.tree_at(lambda fit: fit.scene, done.fit, done.fit.shot)
     assert len(shot_turns(apart, done.tracks, look=partial(KeyFrames, done.clip))) == 1
     assert shot_turns(apart, done.tracks, look=partial(KeyFrames, clip)) == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("distortion", [1.0, -0.5])
+def test_a_shot_by_another_lens_is_told(folder, distortion):
+    clip = rendered(folder / f"lens-{distortion}.mp4", (0, 5), lenses=(lens(), lens(distortion)))
+    done = calibrate_motion(clip, track_video(clip))
+    said = [of for of in done.findings if of.about == "different lenses"]
+    if distortion == 1:
+        assert (said, done.verdict) == ([], "good")
+        return
+    assert done.verdict != "good"
+    assert len(said) == 1
+    assert "frames 20 to 39" in said[0].found or "frames 0 to 19" in said[0].found
+    assert "Calibrate the shots of each camera and lens by themselves" in said[0].advice
+    assert said[0].found in json.dumps(done.summary())
 
 
 class Nothing:

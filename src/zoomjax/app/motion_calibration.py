@@ -16,7 +16,7 @@ import numpy as np
 
 from .._core.text import with_std
 from ..detect.batch import Detection
-from ..fit.contradiction import CONTRADICTED
+from ..fit.contradiction import CONTRADICTED, OTHER_LENS
 from ..fit.joining import join_shots
 from ..fit.losses import IGNORED_LINE
 from ..fit.motion import LOOPS, fit_motion
@@ -57,7 +57,7 @@ from .relative import NOTE, SENTENCE
 FILES = ("lens.json", "track.csv", "tracks.npz", "summary.json", "motion.png", "panorama.jpg")
 """What `MotionCalibration.make` writes; where lines were fitted, too, also lines.npz and lines/."""
 
-_CONTRADICTION = rf".* known focal lengths contradict the tracks|{CONTRADICTED}"
+_CONTRADICTION = rf".* known focal lengths contradict the tracks|{CONTRADICTED}|{OTHER_LENS}"
 """Warnings of `fit_motion`, of which findings tell."""
 _TOLD_SHUTTER = 0.1
 """Standard deviation of the readout, in frames, below which it is told."""
@@ -80,7 +80,7 @@ class MotionCalibration:
         lines: the lines, each frame with its f; None if none were.
         known: focal lengths that were known beforehand.
         warnings: what the user was warned of on the way.
-        contradicted: how tracks contradict the scale of what was known.
+        contradicted: how tracks contradict the scale of what was known, or one lens of all shots.
     """
 
     clip: Path
@@ -378,7 +378,7 @@ def calibrate_motion(
                 focal_std=focal_std,
             )
         told = passed_on(caught, but=_CONTRADICTION)
-        contradicted.extend(of for of in told if of.startswith(CONTRADICTED))
+        contradicted.extend(of for of in told if of.startswith((CONTRADICTED, OTHER_LENS)))
         return jax.block_until_ready(fit)
 
     contradicted, turns = list[str](), []

@@ -1,5 +1,6 @@
 """What a clip cannot tell, with what to do about it: the findings of a calibration from motion."""
 
+import re
 from collections.abc import Iterator, Sequence
 
 import equinox as eqx
@@ -9,6 +10,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float
 
+from ..fit.contradiction import OTHER_LENS
 from ..fit.losses import CAUCHY, IGNORED
 from ..fit.motion import MotionFit
 from ..fit.result import RESULTS
@@ -81,11 +83,39 @@ def findings_of_motion(
 
 
 def with_contradictions(found: Sequence[Finding], contradicted: Sequence[str]) -> list[Finding]:
-    """Findings, and that known focal lengths give all another scale, as warnings of `fit_motion` say."""
+    """Findings, and what warnings of `fit_motion` say to be contradicted.
+
+    That is that known focal lengths give all another scale, and that shots have different lenses.
+    """
+    told = [_of_other_lens(of) if of.startswith(OTHER_LENS) else _of_other_scale(of) for of in contradicted]
+    once = {of.about: of for of in reversed(told)}  # of a clip that is fitted twice
+    return sorted([*once.values(), *found], key=lambda of: -VERDICTS.index(of.verdict))
+
+
+def _of_other_scale(warning: str) -> Finding:
+    found = _begun(warning.partition(" Check")[0])
     todo = "Check --known-focal, --focal-unit and --pixel-pitch, or leave them out."
-    sentences = [of.partition(" Check")[0] for of in contradicted]
-    told = [Finding("known focal lengths", "doubtful", of[0].lower() + of[1:], todo) for of in sentences]
-    return sorted([*told, *found], key=lambda of: -VERDICTS.index(of.verdict))
+    return Finding("known focal lengths", "doubtful", found, todo)
+
+
+def _of_other_lens(warning: str) -> Finding:
+    found = _begun(warning.partition(" Fit ")[0])
+    of_shot = re.search(r"frames (\d+) to (\d+)", found)
+    assert of_shot is not None
+    first, last = of_shot.groups()
+    return Finding(
+        "different lenses",
+        "doubtful",
+        found,
+        "Calibrate the shots of each camera and lens by themselves, or each shot if there is one only, cut "
+        f"as by ffmpeg -i CLIP -vf trim=start_frame={first}:end_frame={int(last) + 1},setpts=PTS-STARTPTS "
+        "-an -crf 10 SHOT.mp4.",
+    )
+
+
+def _begun(sentence: str) -> str:
+    """As it stands after a colon."""
+    return sentence[0].lower() + sentence[1:]
 
 
 def following(fit: MotionFit, tracks: Tracks) -> float:

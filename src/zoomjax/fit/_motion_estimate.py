@@ -6,14 +6,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from ..models.invertibility import certificate_of
 from ..models.lens import ZoomLens
 from ._motion_levers import common_lever, determined_levers
 from ._motion_model import Data, Model, Noise, Stage, pinned, units_of
 from ._motion_parallax import parallax_of
-from ._motion_repeated import common_errors_of
+from ._motion_repeated import Pulls, common_errors_of
 from ._motion_rows import (
     Counted,
     columns_of,
@@ -49,26 +49,35 @@ class _Uncertainty(NamedTuple):
         lens: covariance of the lens's parameters, its offset's, the readout and the common log f.
         log_focal: variance of the logarithm of each frame's focal length.
         inflation: of the variance of points, by the unknowns that were fitted to them.
+        pulls: how groups of frames pull at the lens, in units of what noise would do.
     """
 
     lens: Float[Array, "lens lens"]
     log_focal: Float[Array, "frame"]
     inflation: Float[Array, ""]
+    pulls: Pulls
 
 
 @eqx.filter_jit
 def described(
-    data: Data, model: Model, noise: Noise, stage: Stage, result: Any, steps: Any
-) -> tuple[dict[str, Any], Float[Array, "view"]]:
-    """The parts of a `MotionFit` by name, and the sizes of the residuals of all views, px.
+    data: Data,
+    model: Model,
+    noise: Noise,
+    stage: Stage,
+    result: Any,
+    steps: Any,
+    group: Int[Array, "frame"],
+) -> tuple[dict[str, Any], Float[Array, "view"], Pulls]:
+    """The parts of a `MotionFit` by name, the sizes of the residuals of all views, px, and groups' pulls.
 
-    The latter, and the mean squares, are of residuals times the roots of their weights.
+    The sizes, and the mean squares, are of residuals times the roots of their weights.
 
     Args:
         data: tracks and lines.
         model, noise: the fitted ones.
         stage: the last one, without what holds focal lengths to their neighbours.
         result, steps: of the solver.
+        group: of each frame, the number of what tracks link.
     """
     missed = residuals_of(data, model)
     data = pinned(data, missed, noise)
@@ -80,10 +89,10 @@ def described(
         jnp.zeros(len(focal)).at[data.structure.frame].add(leaf) for leaf in of_views
     )
     unseen = followed <= _FOLLOWED * there
-    known = _uncertainty(data, model, noise, stage, missed, inlier, unseen)
+    known = _uncertainty(data, model, noise, stage, missed, inlier, unseen, group)
     log_std = jnp.sqrt(known.log_focal)
     scaled = jnp.min(jnp.where(unseen, jnp.inf, log_std)) < _UNKNOWN_SCALE
-    lens = _lens_of(data, model, jnp.where(unseen, jnp.nan, focal))
+    lens = lens_of(data, model, jnp.where(unseen, jnp.nan, focal))
     parts = {
         "fit": _fit_of(lens, known.lens[:-2, :-2], squares, followed, judge=(result, scaled), steps=steps),
         "focal": jnp.where(unseen, jnp.nan, focal),
@@ -99,7 +108,7 @@ def described(
         parallax, parallax_std = parallax_of(data, model, noise, inlier)
         parts["parallax"] = jnp.sqrt(jnp.maximum(parallax, 0))
         parts["parallax_score"] = parallax / parallax_std
-    return parts, jnp.linalg.norm(missed, axis=-1)
+    return parts, jnp.linalg.norm(missed, axis=-1), known.pulls
 
 
 def _uncertainty(
@@ -110,6 +119,7 @@ def _uncertainty(
     missed: Float[Array, "view 2"],
     inlier: Bool[Array, "view"],
     unseen: Bool[Array, "frame"],
+    group: Int[Array, "frame"],
 ) -> _Uncertainty:
     """By the rows of what follows the model, with what the loss loses and what tracks have in common."""
     units = units_of(data, model, noise)
@@ -140,16 +150,22 @@ def _uncertainty(
     squared = jnp.sum(missed**2, axis=-1) / (noise.points * CAUCHY) ** 2
     flat = jnp.where(inlier, 1 / (1 + squared), 0)  # of the loss: its slope over the residual
     pull = flat[:, None] * missed / noise.points
-    common = common_errors_of(of_rows, rows._replace(views=pull), matrix, data.structure)
+    common, pulls = common_errors_of(of_rows, rows._replace(views=pull), matrix, data.structure, group)
     kept = jnp.mean(flat**2, where=inlier) if data.root is None else _mean(flat**2, data.counted(inlier))
-    common = common / kept**2 / (_INFLATION * free)
+    usual = kept**2 * _INFLATION * free
+    common, pulls = common / usual, _over(pulls, usual)
     inflation = _INFLATION * free * jnp.where(common > AS_GOOD, common, 1)
     lens, log_focal = lens * inflation, log_focal * inflation
     if model.levers is not None:
         guessed = common_lever(model, rows_at, of_rows, units, data.structure)
         lens = lens + jnp.outer(guessed.lens, guessed.lens)
         log_focal = log_focal + guessed.log_focal**2
-    return _Uncertainty(lens, log_focal, free)
+    return _Uncertainty(lens, log_focal, free, pulls)
+
+
+def _over(pulls: Pulls, variance: Array) -> Pulls:
+    """The same in units in which pulls have this variance."""
+    return pulls._replace(score=pulls.score / jnp.sqrt(variance), scatter=pulls.scatter / variance)
 
 
 def _with_scale(data, lens, both, log_focal, unseen):
@@ -164,7 +180,7 @@ def _mean(values, weight):
     return jnp.sum(weight * values) / jnp.sum(weight)
 
 
-def _lens_of(data: Data, model: Model, focal: Float[Array, "frame"]) -> ZoomLens:
+def lens_of(data: Data, model: Model, focal: Float[Array, "frame"]) -> ZoomLens:
     """The fitted lens, over the focal lengths that are known."""
     return ZoomLens(
         zoom=model.zoom,

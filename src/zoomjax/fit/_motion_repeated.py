@@ -13,7 +13,11 @@ and so two lines that are mistaken for one do no harm.
 
 Views of a track may have errors in common, too: the track drifts, its point is nearer than others, or it is
 on a thing that moves. The same mean, of the scores of tracks, is then what variances are too small by.
+
+Scores of all tracks of a shot, and what they tell of the lens, are what its own lens would be told from.
 """
+
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -35,6 +39,23 @@ _NEAR = 0.01
 """Between the normals of planes, radians: below this two lines are one, seen twice."""
 
 _LITTLE = 1e-9  # added to the diagonal: unknowns that no view sees
+
+
+class Pulls(NamedTuple):
+    """How groups of frames that nothing links pull at the lens that they share, without frames and rays.
+
+    Attributes:
+        score: of each group, the sum of its views' pulls.
+        fisher: what each group tells of the lens.
+        of_tracks: what its tracks alone tell.
+        scatter: sum over its tracks of the products of their own scores. Where errors of views are
+            independent, and as large as they are taken to be, it is as `of_tracks`.
+    """
+
+    score: Float[Array, "group lens"]
+    fisher: Float[Array, "group lens lens"]
+    of_tracks: Float[Array, "group lens lens"]
+    scatter: Float[Array, "group lens lens"]
 
 
 def groups_of(data: Data, model: Model, scene: Int[np.ndarray, "frame"]) -> Int[np.ndarray, "line"]:
@@ -73,8 +94,8 @@ def repeated(
 
 
 def common_errors_of(
-    of_rows: Columns, pull: Rows, matrix: Reduced, structure: Structure
-) -> Float[Array, ""]:
+    of_rows: Columns, pull: Rows, matrix: Reduced, structure: Structure, group: Int[Array, "frame"]
+) -> tuple[Float[Array, ""], Pulls]:
     """The mean square of how tracks pull at the lens, over what independent views of noise 1 would do.
 
     Args:
@@ -82,6 +103,10 @@ def common_errors_of(
         pull: of each view, and of what is known of each ray, the derivative of its loss by its residual.
         matrix: the normal equations.
         structure: which track and frame each view belongs to.
+        group: of each frame, the number of what tracks link.
+
+    Returns:
+        That, and how the groups pull.
     """
     information, by_lens = lens_equations(matrix)
     answer = by_lens.reshape(-1, 4, by_lens.shape[-1])
@@ -108,7 +133,30 @@ def common_errors_of(
         fisher = fisher - of_ray[:, :-1].T @ inverse @ of_ray
         return fisher[:, -1], fisher[:, :-1]
 
-    return _more_than_chance((fisher, of_rays, matrix.rays[0]), without_ray, information)
+    parts = fisher, of_rays, matrix.rays[0]
+    of_track = jnp.zeros(structure.tracks, int).at[structure.track].max(group[structure.frame])
+
+    def add(sums, number, there):
+        score, fisher = jax.vmap(without_ray)(jax.tree.map(lambda of: of[number], parts))
+        new = score, fisher, score[:, :, None] * score[:, None]
+        where = jnp.where(there, of_track[number], len(group))  # beyond: dropped
+        return tuple(of.at[where].add(more) for of, more in zip(sums, new, strict=True)), None
+
+    shapes = (size,), (size, size), (size, size)
+    sums = tuple(jnp.zeros((len(group), *shape)) for shape in shapes)
+    (score, of_tracks, scatter), _ = over_views(structure.tracks, add, sums)
+    by_frame, of_lens = of_rows.by_frame, of_rows.by_lens
+    frame, of_line = jnp.arange(len(group)), structure.line_frame
+    rows = (
+        (frame, of_lens.frames - by_frame.frames[..., None] * answer[frame], pull.frames),
+        (of_line, of_lens.lines - jnp.einsum("lrf,lfp->lrp", by_frame.lines, answer[of_line]), pull.lines),
+    )
+    told = of_tracks
+    for place, effect, row in rows:
+        score = score.at[group[place]].add(jnp.einsum("lrp,lr->lp", effect, row))
+        told = told.at[group[place]].add(jnp.einsum("lrp,lrq->lpq", effect, effect))
+    pulls = Pulls(score, told, of_tracks, scatter)
+    return _more_than_chance(parts, without_ray, information), pulls
 
 
 def _more_than_chance(groups, of_group, information):

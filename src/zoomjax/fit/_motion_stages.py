@@ -104,7 +104,7 @@ _averaged = eqx.filter_jit(averaged)
 
 def with_all(few, data, model, noise):
     """A model fitted to some of the tracks, and its noise, with rays of all of them."""
-    model, noise, *_ = _settled(few, model, noise)
+    model, noise, *_ = settled(few, model, noise)
     give_back()  # here and below: what compiling took is not there beside what a long clip takes
     rays = jnp.zeros((data.structure.tracks, 3))
     model = eqx.tree_at(lambda m: m.path.rays, model, rays)
@@ -130,38 +130,53 @@ def continued(data, path, lens, readout, noise):
     return model, noise
 
 
-def in_stages(data, model, noise, scene):
+def refitted(data, model, noise):
+    """The model of least energy of a part of the data, by the programs of all of it.
+
+    Args:
+        data: of which fewer views are there.
+        model, noise: fitted to all.
+    """
+    wide = _arrays((model, noise.wider(STAGES[0].wider), STAGES[1]))
+    model, noise, *_ = _solved(data, *wide)
+    return settled(data, model, noise)[0]
+
+
+def in_stages(data, model, noise, scene, linked):
     """The last stage, until nothing changes, and what is known about the fit.
 
     Args:
         data: tracks and lines.
         model, noise: of `begun`.
         scene: number of each frame's scene.
+        linked: of each frame, the number of what tracks link; -1 for those without views.
 
     Returns:
         The parts of a `MotionFit` by name, the sizes of the residuals of all views, times the roots of
-        their weights, the model, and the noise that residuals were weighted by last.
+        their weights, how groups pull at the lens, the model, and the noise that residuals were weighted
+        by last.
     """
-    model, noise, weighted_by, result, steps = _settled(data, model, noise)
+    model, noise, weighted_by, result, steps = settled(data, model, noise)
     for _ in range(_MOST_COUNTS if data.lines is not None else 0):
         group = groups_of(data, model, scene)
         more = repeated(data, model, *_arrays((noise, STAGES[-1])), group=jnp.asarray(group))
         if 1 / AS_GOOD < more < AS_GOOD or (more <= 1 and noise.repeated == 1):
             break
         noise = noise._replace(repeated=jnp.maximum(noise.repeated * more, 1.0))
-        model, noise, weighted_by, result, steps = _settled(data, model, noise)
+        model, noise, weighted_by, result, steps = settled(data, model, noise)
     free = _arrays(STAGES[-1]._replace(own=_FREE))
+    linked = jnp.asarray(np.pad(np.maximum(linked, 0), (0, len(data.log_focal) - len(linked))))
     give_back()
-    parts, missed = described(data, model, noise, free, result, steps)
+    parts, missed, pulls = described(data, model, noise, free, result, steps, linked)
     open_scale = bool(parts["fit"].result == RESULTS.undetermined)  # then the lens is, and looks like one
     seen = not open_scale and is_seen(parts["parallax"], parts["parallax_score"])
     spread = spread_of(data, model, _arrays(noise), missed, parts["parallax"]) if seen else None
     if spread is not None and spread.std < MOST:
         model = dataclasses.replace(model, levers=guessed_levers(spread, data.structure.tracks))
-        model, noise, weighted_by, result, steps = _settled(data, model, noise)
-        again, missed = described(data, model, noise, free, result, steps)
+        model, noise, weighted_by, result, steps = settled(data, model, noise)
+        again, missed, pulls = described(data, model, noise, free, result, steps, linked)
         parts = parts | again
-    return parts, missed, *_arrays((model, weighted_by))
+    return parts, missed, pulls, *_arrays((model, weighted_by))
 
 
 def _best(tried, data):
@@ -173,7 +188,7 @@ def _best(tried, data):
     return tried[int(np.argmin(np.nan_to_num(costs, nan=np.inf)))]
 
 
-def _settled(data, model, noise):
+def settled(data, model, noise):
     """The last stage until it changes nothing: the model, its noise, that before, the status, the steps.
 
     Where little tells the scale of f, the way to the minimum is long and bent, and each step short.

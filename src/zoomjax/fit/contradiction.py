@@ -1,15 +1,20 @@
-"""Known focal lengths that tracks contradict, one by one or all together."""
+"""What tracks contradict: known focal lengths, one by one or all together, and one lens of all shots."""
 
 import warnings
 
 import numpy as np
+from jaxtyping import Int
 
+from ._motion_apart import Apart
 from ._motion_model import Model, Noise
 from ._motion_problem import Given
 from .motion_fit import MotionFit
 
 CONTRADICTED = "Known focal lengths have another scale than the tracks"
 """How the warning of all together begins."""
+
+OTHER_LENS = "Shots contradict one lens"
+"""How the warning of shots with different lenses begins."""
 
 _CLOSER, _OTHER = 1.1, 0.03
 """From where on it is given: noise over that without known focal lengths, and these apart in log f."""
@@ -60,3 +65,24 @@ def warn_of_other_scale(given: Given, fit: MotionFit, noise: Noise, free: tuple[
             "results.",
             stacklevel=2,
         )
+
+
+def warn_of_other_lens(apart: Apart, shot: Int[np.ndarray, "frame"]) -> None:
+    """A shot that does not have the lens that all shots are fitted with.
+
+    Args:
+        apart: what it differs by.
+        shot: of each frame that tracks link to it, the number of its shot; -1 for others.
+    """
+    frames = np.flatnonzero(shot == np.argmax(np.bincount(shot[shot >= 0])))
+    longer = np.expm1(apart.longer)
+    differs = f"focal lengths {abs(longer):.1%} {'longer' if longer > 0 else 'shorter'}"
+    if np.isfinite(apart.corner):
+        where = "outwards" if apart.corner > 0 else "inwards"
+        differs += f", and a correction that moves the corners {abs(apart.corner):.3g} px farther {where},"
+    warnings.warn(
+        f"{OTHER_LENS}: by itself the shot of frames {frames[0]} to {frames[-1]} has {differs} than by the "
+        "lens of all shots. Fit the tracks of each by themselves: they may be of two cameras or lenses, or "
+        "the fit of all may have gone wrong.",
+        stacklevel=2,
+    )

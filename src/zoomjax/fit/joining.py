@@ -210,7 +210,7 @@ class _Seen(NamedTuple):
         single[np.unique(cells, axis=0, return_index=True)[1]] = True
         points = one[moves & single], other[moves & single]
         focal, std = (np.asarray(of)[list(matches.frames)] for of in (fit.focal, fit.focal_std))
-        flat = [_flat(fit.lens, f, of) for f, of in zip(focal, points, strict=True)]
+        flat = [flat_points(fit.lens, f, of) for f, of in zip(focal, points, strict=True)]
         turns = np.asarray(fit.rotation)[list(matches.frames)]
         loose = np.nan_to_num(np.hypot(*(std / focal)), nan=_LOOSE)
         return cls(
@@ -324,7 +324,7 @@ def _moved(fit, first, poses, scaled):
     )
 
 
-def _flat(lens, focal, points):
+def flat_points(lens, focal, points):
     """Points without distortion, about the centre, over f."""
     more = bucket(len(points)) - len(points)
     return np.asarray(_flattened(lens, focal, np.pad(points, ((0, more), (0, 0)))))[: len(points)]

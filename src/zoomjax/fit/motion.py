@@ -23,15 +23,17 @@ from ..models.polynomial import RadialPolynomial
 from ..models.requirements import check
 from ..models.zoom import AbstractZoom, PolynomialZoom
 from ..tracks.tracks import Tracks
+from ._motion_apart import group_apart
 from ._motion_begin import begins_near, from_earlier
 from ._motion_gradient import sensitive
 from ._motion_model import Model, Noise, scaled
 from ._motion_problem import LONGEST_LOOP, Asked, Given, Problem, problem_of, relative, thinned
 from ._motion_stages import begun, in_stages, with_all
 from ._motion_start import starts_of, views_by_frame
-from .contradiction import warn_of_contradiction, warn_of_other_scale
+from .contradiction import warn_of_contradiction, warn_of_other_lens, warn_of_other_scale
 from .defaults import zoom_or_default
 from .motion_fit import MotionFit, thrown_motion
+from .result import RESULTS
 
 LOOPS = LONGEST_LOOP
 """The most frames of a clip in which a camera that comes back closes a loop: tracks stay whole."""
@@ -104,7 +106,8 @@ def fit_motion(
 
     Warns:
         UserWarning: known focal lengths are far from those that the tracks say, by the fit or by one
-            without them, which is made if `begin` is not given.
+            without them, which is made if `begin` is not given; or shots that no track links contradict
+            that they have one lens.
 
     References:
         L. de Agapito, E. Hayman, I. Reid, "Self-calibration of rotating and zooming cameras", IJCV 2001.
@@ -163,7 +166,7 @@ def _solved_motion(given, asked):
     """The fit, the model that it is of, and the noise."""
     problem, frames = problem_of(given, asked), given.tracks.frames
     found = (from_earlier if begins_near(given) else _from_nothing)(given, asked, problem)
-    parts, missed, model, noise = in_stages(problem.data, *found, problem.scene)
+    parts, missed, pulls, model, noise = in_stages(problem.data, *found, problem.scene, problem.linked)
     parts["fit"] = eqx.tree_at(lambda fit: fit.frame_rms, parts["fit"], parts["fit"].frame_rms[:frames])
     if problem.data.root is not None:
         missed = missed / problem.data.root
@@ -184,6 +187,10 @@ def _solved_motion(given, asked):
         if given.begin is None and np.isfinite(given.focal).any():  # else the earlier fit has told
             free = given._replace(focal=None, focal_std=None)
             warn_of_other_scale(given, fit, noise, _from_nothing(free, asked, problem_of(free, asked)))
+    if fit.fit.result == RESULTS.successful:
+        apart = group_apart(problem.data, model, noise, problem.linked, pulls)
+        if apart is not None:
+            warn_of_other_lens(apart, np.where(problem.linked == apart.group, problem.shot, -1))
     return fit, model, noise
 
 
