@@ -51,6 +51,28 @@ def told(tracks, **options):
     return [str(of.message) for of in caught if str(of.message).startswith(OTHER_LENS)], fit
 
 
+def test_focal_lengths_that_jump_at_a_cut():
+    """The second shot was begun with f of the first one's end, and found 8 times as long as it is."""
+    parts, focals, count = [], [], 0
+    for number, ends in enumerate([(2390, 2000), (810, 1000)]):
+        focal, rotation = (
+            np.linspace(*ends, FRAMES),
+            pan_and_zoom(lens(), 72, pan=30, tilt=6, seed=2 + number)[1],
+        )
+        scene = motion_tracks(
+            lens(), focal, rotation[48 * number :][:FRAMES], views=60, life=12, seed=2 + number, noise=0.1
+        )
+        track, frame, points = scene.tracks.views()
+        parts.append((track + count, frame + FRAMES * number, points))
+        count += track.max() + 1
+        focals.append(focal)
+    track, frame, points = (np.concatenate(of) for of in zip(*parts, strict=True))
+    tracks = Tracks.from_arrays(track, frame, points, image_size=SIZE, frames=2 * FRAMES)
+    said, fit = told(tracks)
+    assert not said
+    assert np.abs(np.log(np.asarray(fit.focal) / np.concatenate(focals))).max() < 0.02
+
+
 @pytest.fixture(scope="module")
 def two_lenses():
     return clip([lens(), lens(distortion=0.5)])

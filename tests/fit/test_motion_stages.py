@@ -33,8 +33,10 @@ def asked():
 
 @pytest.fixture(scope="module")
 def starts(problem):
-    by_frame = views_by_frame(problem.piece, problem.moment, len(problem.data.log_focal))
-    return starts_of(problem.data.points, problem.data.structure.tracks, float(SIZE[0]), by_frame)
+    frames, tracks = len(problem.data.log_focal), problem.data.structure.tracks
+    by_frame = views_by_frame(problem.piece, problem.moment, frames)
+    part = jnp.zeros(frames, int), jnp.zeros(tracks, int)
+    return starts_of(problem.data.points, tracks, float(SIZE[0]), by_frame, part)
 
 
 def chosen(problem, starts):

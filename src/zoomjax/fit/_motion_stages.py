@@ -24,7 +24,7 @@ from ._motion_rows import (
     residuals_of,
     rows_of,
 )
-from ._motion_start import STARTS, disagreement
+from ._motion_start import disagreement
 from ._normal_solver import damped_solver
 from ._schur import Schur
 from ._views import EXACT, FAR, MEDIAN_OF_SIZE, core_median
@@ -80,7 +80,7 @@ def begun(data, paths, spreads, zoom, shift, distortion_model, terms):
     """
     tried: list[Any] = []
     glance = STAGES[0]._replace(change=_GLANCE * np.sqrt(np.sum(data.there) / _parts(data)))
-    for path, spread in zip(_each(paths), spreads, strict=True):
+    for path, spread in zip(_each(paths, len(spreads)), spreads, strict=True):
         focal = np.exp(np.asarray(path.log_focal))
         prepared = None if shift is None else shift.prepare(focal, 2)
         nothing = Speed(*2 * (jnp.zeros((len(focal), 4)),))
@@ -206,9 +206,9 @@ def settled(data, model, noise):
             return model, noise, weighted_by, result, steps
 
 
-def _each(paths):
-    """The paths in a stack."""
-    return [jax.tree.map(lambda leaf, place=place: leaf[place], paths) for place in range(STARTS)]
+def _each(paths, number):
+    """The first paths in a stack."""
+    return [jax.tree.map(lambda leaf, place=place: leaf[place], paths) for place in range(number)]
 
 
 def _arrays(tree):

@@ -2,7 +2,8 @@
 
 The rays of the first frame follow from a guess of its focal length. Each frame after it is fitted to the
 rays that frames before it gave (log f and rotation, robustly), and its views give or improve rays. All
-guesses run side by side; those that most views follow best are starts.
+guesses run side by side; those that most views follow best are starts. Nothing carries the focal length
+over a cut, so that one more start has of each part of a clip the guess that is best there.
 
 A camera often follows something that moves. What has a share of the tracks, and stays where it was in the
 image, then draws a fit that begins with the frame before. So each fit begins with what most of the frame's
@@ -92,17 +93,20 @@ def starts_of(
     tracks: int,
     width: float,
     by_frame: tuple,
+    part: tuple[Int[Array, "frame"], Int[Array, "track"]],
     root: Float[Array, "view"] | None = None,
 ) -> tuple[Path, Array]:
     """The best `STARTS` chains of all guesses, best first, and the medians of their frames' residuals, px.
 
-    Where views have weights, residuals are times their roots.
+    And after these a chain made of the best of each part. Where views have weights, residuals are times
+    their roots.
 
     Args:
         points: of each view, about the centre of the image, px.
         tracks: their number.
         width: of the image, px.
         by_frame: of `views_by_frame`.
+        part: the number of each frame's and of each track's part, as tracks link them.
         root: of each view's weight; None for equal ones.
     """
     track, view, present = by_frame
@@ -131,13 +135,29 @@ def starts_of(
 
         return jax.vmap(frame)(path.log_focal, path.rotation, track, present, seen, roots)
 
+    def cost(path):
+        """The sums of each part's disagreement, and of its views."""
+        cost, weight = _costs(missed(path), near), 1.0 if roots is None else roots**2
+        there = ~jnp.isnan(cost)
+        sums = [jnp.sum(jnp.where(there, of, 0), axis=1) for of in (weight * cost, weight * there)]
+        return [jax.ops.segment_sum(of, part[0], len(part[0])) for of in sums]
+
     paths, residuals = jax.vmap(chain)(jnp.asarray(guesses, points.dtype))
     residuals = jnp.where(jnp.isfinite(residuals), residuals, jnp.inf)
     near = CAUCHY * jnp.min(residuals) / MEDIAN_OF_SIZE
-    weight = None if roots is None else roots**2
-    costs = jax.lax.map(lambda path: disagreement(missed(path), near, weight), paths)
-    best = jnp.argsort(jnp.where(jnp.isfinite(residuals), costs, jnp.inf))[:STARTS]
-    return jax.tree.map(lambda leaf: leaf[best], paths), residuals[best]
+    costs, views = jax.lax.map(cost, paths)
+    usable = jnp.isfinite(residuals)
+    total = jnp.where(usable, jnp.sum(costs, axis=1) / jnp.sum(views, axis=1), jnp.inf)
+    best = jnp.argsort(total)[:STARTS]
+    of_part = jnp.argmin(jnp.where(usable[:, None] & (views > 0), costs, jnp.inf), axis=0)
+    frame, track = (of_part[of] for of in part)
+    mixed = Path(
+        paths.log_focal[frame, jnp.arange(len(frame))],
+        paths.rotation[frame, jnp.arange(len(frame))],
+        paths.rays[track, jnp.arange(tracks)],
+    )
+    paths = jax.tree.map(lambda leaf, more: jnp.concatenate([leaf[best], more[None]]), paths, mixed)
+    return paths, residuals[jnp.append(best, best[0])]
 
 
 def disagreement(
@@ -146,10 +166,14 @@ def disagreement(
     weight: Float[Array, "*some"] | None = None,
 ) -> Float[Array, ""]:
     """How far views are off, in all, where those far off count little more: a mean; NaN is no view."""
-    cost = jnp.log1p((size / near) ** 2)
+    cost = _costs(size, near)
     if weight is None:
         return jnp.nanmean(cost)
     return jnp.nansum(weight * cost) / jnp.sum(jnp.where(jnp.isnan(cost), 0, weight))
+
+
+def _costs(size, near):
+    return jnp.log1p((size / near) ** 2)
 
 
 def views_by_frame(

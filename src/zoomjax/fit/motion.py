@@ -201,7 +201,9 @@ def _from_nothing(given, asked, problem):
     if not all(np.array_equal(getattr(few, of), getattr(problem, of)) for of in ("shot", "linked")):
         few = problem  # what links two parts of a shot is missing
     by_frame = views_by_frame(few.piece, few.moment, len(few.data.log_focal))
-    paths, spreads = _started(few.data, by_frame, jnp.asarray(_parts_of(few)))
+    paths, spreads = _started(few.data, by_frame, jnp.asarray(part := _parts_of(few)))
+    if not part.any():  # of one part, the last start is the first
+        spreads = spreads[:-1]
     found = begun(few.data, paths, spreads, asked.zoom, asked.shift, asked.distortion_model, asked.terms)
     return found if few is problem else with_all(few.data, problem.data, *found)
 
@@ -268,9 +270,9 @@ def _started(data, by_frame, part):
     Each part that tracks link is scaled to those of its own frames; others as all of them are.
     """
     tracks, width = data.structure.tracks, 1.6 * data.scale
-    paths, spreads = starts_of(data.points, tracks, width, by_frame, data.root)
     track, frame = data.structure.track, data.structure.frame
-    of_track = jnp.zeros(data.structure.tracks, int).at[track].max(jnp.where(data.there, part[frame], 0))
+    of_track = jnp.zeros(tracks, int).at[track].max(jnp.where(data.there, part[frame], 0))
+    paths, spreads = starts_of(data.points, tracks, width, by_frame, (part, of_track), data.root)
 
     def to_known(path):
         off = jnp.where(jnp.isinf(data.log_std), jnp.nan, data.log_focal - path.log_focal)
