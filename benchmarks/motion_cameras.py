@@ -2,15 +2,15 @@
 
 import time
 from pathlib import Path
-from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from zoomjax import Distortion, Lines
+from zoomjax import Distortion, Lines, ZoomLens
 from zoomjax.fit import RESULTS, MotionFit, fit_motion
+from zoomjax.models import TableZoom
 from zoomjax.scenes import MotionScene, motion_tracks
 
 from .motion_simulated import SHOWN, SIZE, Rows, corrected, wide
@@ -18,17 +18,20 @@ from .real.study_broadcast import SCALE, Clip, looking_at, pitch_lines, read_cli
 
 
 class FrameLenses:
-    """The lenses of a clip's frames, by focal length: a radial polynomial that inverts OpenCV's."""
+    """The lenses of a clip's frames: radial polynomials that invert OpenCV's, and one lens of them all.
+
+    Frames of one focal length have others by its last digits, by which the lens tells them apart.
+    """
 
     def __init__(self, clip: Clip, frames: np.ndarray):
-        self.image_size, self.focal = SIZE, clip.focal[frames] * (1 + 1e-9 * np.arange(len(frames)))
+        self.focal = clip.focal[frames] * (1 + 1e-9 * np.arange(len(frames)))
         self.centre = clip.principal[frames]
         self.k = [_inverse(f, k) for f, k in zip(clip.focal[frames], clip.k[frames], strict=True)]
-
-    def __call__(self, focal: float) -> Distortion:
-        """The lens of the frame with this focal length."""
-        frame = int(np.argmin(abs(self.focal - focal)))
-        return Distortion(self.k[frame], self.centre[frame], np.array(SCALE))
+        middle, order = (np.array(SIZE) - 1) / 2, np.argsort(1 / self.focal)
+        each = np.array(self.k)[order], (self.centre[order] - middle) / SCALE
+        zoom, shift = (TableZoom(parameters=of, knots=1 / self.focal[order]) for of in each)
+        ends = np.array([self.focal.min(), self.focal.max()])
+        self.lens = ZoomLens(zoom, middle, ends, SIZE, "px", shift=shift)
 
 
 def _inverse(focal: float, k: np.ndarray) -> np.ndarray:
@@ -46,11 +49,11 @@ def real_scene(
 ) -> tuple[FrameLenses, MotionScene, Lines, np.ndarray]:
     """Tracks and pitch lines of a clip; the frames of the lines."""
     frames = np.arange(0, len(clip.focal), 4)
-    lenses: Any = FrameLenses(clip, frames)
+    lenses = FrameLenses(clip, frames)
     time = np.linspace(0, 2 * np.pi * len(frames) / 150, len(frames))
     aims = np.column_stack([30 * np.sin(1.3 * time), 5 + 10 * np.sin(2.1 * time), 0 * time])
     turns = np.stack([looking_at(clip.position, aim) for aim in aims])
-    scene = motion_tracks(lenses, lenses.focal, turns, noise=0.5, pupil=pupil, seed=seed)
+    scene = motion_tracks(lenses.lens, lenses.focal, turns, noise=0.5, pupil=pupil, seed=seed)
     rng = np.random.default_rng(seed)
     some = np.arange(0, len(frames), 5)
     seen = [pitch_lines(clip, frames[place], turns[place]) for place in some]
