@@ -81,18 +81,22 @@ def widest(on: bool = True) -> contextlib.AbstractContextManager:
 def in_float64(function: Callable[..., Any], *given: Any) -> Any:
     """What a function gives of arrays that are known, computed in float64, in the widest of their dtypes.
 
-    For what float32 has no room for, as products of derivatives that are nearly alike. Of traced arrays it
-    is computed in their own dtype.
+    For what float32 has no room for, as products of derivatives that are nearly alike. Of arrays that are
+    traced, or in other processes, too, it is computed in their own dtype.
     """
     own = [leaf.dtype for leaf in jax.tree.leaves(given) if _is_real(leaf)]
     # Without x64 JAX computes with arrays of NumPy in float32, whatever theirs is.
     dtype = jax.dtypes.canonicalize_dtype(np.result_type(*own) if own else float)
-    if dtype == np.float64 or traced(given):
+    if dtype == np.float64 or traced(given) or not all(map(_is_here, jax.tree.leaves(given))):
         return function(*given)
     with widest():
         result = function(*(_cast(one, np.dtype(float)) for one in given))
         result = jax.tree.map(np.asarray, result)
     return jax.tree.map(jnp.asarray, _cast(result, dtype))
+
+
+def _is_here(leaf: Any) -> bool:
+    return not isinstance(leaf, jax.Array) or leaf.is_fully_addressable
 
 
 def _is_real(leaf: Any) -> bool:
