@@ -3,7 +3,8 @@
 The rays of the first frame follow from a guess of its focal length. Each frame after it is fitted to the
 rays that frames before it gave (log f and rotation, robustly), and its views give or improve rays. All
 guesses run side by side; those that most views follow best are starts. Nothing carries the focal length
-over a cut, so that one more start has of each part of a clip the guess that is best there.
+over a cut: there each chain begins with its guess again, and one more start has of each part of a clip the
+guess that is best there.
 
 A camera often follows something that moves. What has a share of the tracks, and stays where it was in the
 image, then draws a fit that begins with the frame before. So each fit begins with what most of the frame's
@@ -115,14 +116,20 @@ def starts_of(
     drawn = np.random.default_rng(0).uniform(size=(1, _PAIRS, 2))
     drawn = (drawn + 0.618 * jnp.arange(len(track))[:, None, None]) % 1  # other ones in each frame
 
+    number = jnp.arange(len(track))
+    there = jnp.where(jnp.any(present, axis=1), number, len(track))
+    first = jax.ops.segment_min(there, part[0], len(track))
+
     def chain(focal):
         state = _State(jnp.log(focal), jnp.eye(3), jnp.zeros((tracks, 3)), jnp.zeros(()))
 
         def step(state, frame):
+            *frame, fresh = frame
+            state = state._replace(log_focal=jnp.where(fresh, jnp.log(focal), state.log_focal))
             state = _next(state, *frame, near=_AGREES * width)
             return state, (state.log_focal, state.rotation, state.residual)
 
-        frames = (track, present, seen, drawn, roots)
+        frames = (track, present, seen, drawn, roots, number == first[part[0]])
         final, (log_focal, rotation, residual) = jax.lax.scan(step, state, frames)
         norm = jnp.linalg.norm(final.rays, axis=1, keepdims=True)
         rays = jnp.where(norm > 0, final.rays / jnp.where(norm > 0, norm, 1), jnp.array([[0.0, 0.0, 1.0]]))
@@ -152,8 +159,8 @@ def starts_of(
     of_part = jnp.argmin(jnp.where(usable[:, None] & (views > 0), costs, jnp.inf), axis=0)
     frame, track = (of_part[of] for of in part)
     mixed = Path(
-        paths.log_focal[frame, jnp.arange(len(frame))],
-        paths.rotation[frame, jnp.arange(len(frame))],
+        paths.log_focal[frame, number],
+        paths.rotation[frame, number],
         paths.rays[track, jnp.arange(tracks)],
     )
     paths = jax.tree.map(lambda leaf, more: jnp.concatenate([leaf[best], more[None]]), paths, mixed)
