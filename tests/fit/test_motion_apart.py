@@ -11,7 +11,7 @@ from scipy.stats import chi2
 
 from zoomjax import PolynomialZoom
 from zoomjax.fit import _motion_apart, _motion_stages, fit_motion
-from zoomjax.fit._motion_apart import disagreement
+from zoomjax.fit._motion_apart import heterogeneity
 from zoomjax.fit._motion_repeated import Pulls
 from zoomjax.fit.contradiction import OTHER_LENS
 from zoomjax.scenes import motion_lines, motion_tracks, pan_and_zoom
@@ -95,10 +95,10 @@ def test_shots_of_one_lens_are_not_told(monkeypatch):
     compared = []
 
     def seen(*given):
-        compared.append(disagreement(*given))
+        compared.append(heterogeneity(*given))
         return compared[-1]
 
-    monkeypatch.setattr(_motion_apart, "disagreement", seen)
+    monkeypatch.setattr(_motion_apart, "heterogeneity", seen)
     said, _ = told(clip([lens(), lens()])[0])
     assert said == []
     total, free, *_ = compared[0]
@@ -107,7 +107,7 @@ def test_shots_of_one_lens_are_not_told(monkeypatch):
 
 
 def test_one_shot_is_not_compared(monkeypatch):
-    monkeypatch.setattr(_motion_apart, "disagreement", lambda *_: pytest.fail("compared"))
+    monkeypatch.setattr(_motion_apart, "heterogeneity", lambda *_: pytest.fail("compared"))
     assert told(clip([lens()])[0])[0] == []
 
 
@@ -195,15 +195,15 @@ def pulls_of(rng, groups, *, tracks=300, apart=0.0, louder=1.0):
 
 
 @pytest.mark.parametrize("louder", [1.0, 3.0])
-def test_disagreement_is_chi_squared_where_there_is_none(rng, louder):
-    chances = [chi2.sf(*disagreement(pulls_of(rng, 3, louder=louder), 3)[:2]) for _ in range(200)]
-    assert disagreement(pulls_of(rng, 3), 3)[1] == 8
+def test_heterogeneity_is_chi_squared_where_there_is_none(rng, louder):
+    chances = [chi2.sf(*heterogeneity(pulls_of(rng, 3, louder=louder), 3)[:2]) for _ in range(200)]
+    assert heterogeneity(pulls_of(rng, 3), 3)[1] == 8
     assert np.mean(chances) == pytest.approx(0.5, abs=0.08)
     assert np.min(chances) > 1e-5
 
 
-def test_disagreement_grows_with_what_a_group_is_apart(rng):
-    total, free, squares, ranks = disagreement(pulls_of(rng, 3, apart=12.0), 3)
+def test_heterogeneity_grows_with_what_a_group_is_apart(rng):
+    total, free, squares, ranks = heterogeneity(pulls_of(rng, 3, apart=12.0), 3)
     assert chi2.sf(total, free) < 1e-8
     assert np.argmax(squares) == 0
     assert ranks.tolist() == [4, 4, 4]
@@ -215,7 +215,7 @@ def test_what_a_group_does_not_tell_is_not_compared(rng):
     first = [np.array(of) for of in blind]
     for place, of in enumerate(first):
         of[1] = keep @ of[1] if place == 0 else keep @ of[1] @ keep
-    total, free, _, ranks = disagreement(Pulls(*map(jnp.asarray, first)), 3)
+    total, free, _, ranks = heterogeneity(Pulls(*map(jnp.asarray, first)), 3)
     assert ranks.tolist() == [4, 2, 4]
     assert free == 6
     assert chi2.sf(total, free) > 1e-5

@@ -87,7 +87,7 @@ def in_float64(function: Callable[..., Any], *given: Any) -> Any:
     own = [leaf.dtype for leaf in jax.tree.leaves(given) if _is_real(leaf)]
     # Without x64 JAX computes with arrays of NumPy in float32, whatever theirs is.
     dtype = jax.dtypes.canonicalize_dtype(np.result_type(*own) if own else float)
-    if dtype == np.float64 or traced(given) or not all(map(_is_here, jax.tree.leaves(given))):
+    if dtype == np.float64 or traced(given) or not all(map(_is_addressable, jax.tree.leaves(given))):
         return function(*given)
     with widest():
         result = function(*(_cast(one, np.dtype(float)) for one in given))
@@ -95,7 +95,7 @@ def in_float64(function: Callable[..., Any], *given: Any) -> Any:
     return jax.tree.map(jnp.asarray, _cast(result, dtype))
 
 
-def _is_here(leaf: Any) -> bool:
+def _is_addressable(leaf: Any) -> bool:
     return not isinstance(leaf, jax.Array) or leaf.is_fully_addressable
 
 

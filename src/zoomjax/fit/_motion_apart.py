@@ -72,7 +72,7 @@ def group_apart(
     number = int(np.max(group)) + 1
     if number < 2 or not all(np.isfinite(np.asarray(part)[:number]).all() for part in pulls):
         return None
-    total, free, squares, own = disagreement(pulls, number)
+    total, free, squares, own = heterogeneity(pulls, number)
     if not chi2.sf(total, max(free, 1)) < _CHANCE:
         return None
     lever = _LEVERS * (0.0 if model.levers is None else float(model.levers.std))
@@ -88,7 +88,7 @@ def group_apart(
     return apart if far > 1 else None
 
 
-def disagreement(
+def heterogeneity(
     pulls: Pulls, groups: int
 ) -> tuple[float, int, Float[np.ndarray, "group"], Int[np.ndarray, "group"]]:
     """How far groups are from one lens.
